@@ -64,7 +64,7 @@ class Maze(World):
         unit_features=0,
         frequencies=5,
     )
-    features, objects = 2, 1
+    features, objects, names = 2, 1, ["ball"]
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
     observation_space = gymnasium.spaces.Box(-20.0, 20.0, (4,), np.float64)
 
@@ -125,11 +125,6 @@ class Maze(World):
         """See `World`."""
         maze = self._simulator.maze
         return PIXELS * (np.asarray(centers) * (1, -1) + (maze.x_map_center, maze.y_map_center))
-
-    @property
-    def names(self) -> list[str]:
-        """See `World`."""
-        return ["ball"]
 
     @property
     def landmarks(self) -> dict[str, NDArray[np.floating]]:

@@ -42,12 +42,12 @@ PREDICTORS = {
 }
 
 EXPLANATION = (
-    "{samples} samples of each prediction of {windows} held-out windows, in which {moved}. f predicts the state after "
-    "each action; h the state after the segment, with codes from the prior (what can be known before acting) or from "
-    "the guide, which knows the result; g the actions. No verdict rests on the objects that moved more than {scale}: "
-    "that group is chosen by the truth, so that a right model need not cover 90 % of it. The stated scale is the "
-    "spread of the samples, the RMS error of their mean what is right. Scales are the weights of the loss: one four "
-    "times too wide weighs its term sixteen times too little."
+    "{samples} samples of each prediction of {windows} held-out windows, in which something moved, as in training. f "
+    "predicts the state after each action; h the state after the segment, with codes from the prior (what can be known "
+    "before acting) or from the guide, which knows the result; g the actions. No verdict rests on the objects that "
+    "moved more than {scale}: that group is chosen by the truth, so that a right model need not cover 90 % of it. The "
+    "stated scale is the spread of the samples, the RMS error of their mean what is right. Scales are the weights of "
+    "the loss: one four times too wide weighs its term sixteen times too little."
 )
 
 
@@ -59,7 +59,7 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
         windows: held-out windows, at most.
         samples: samples of each prediction.
     """
-    window, episodes = context.held_out(windows)
+    (window, episodes), space = context.held_out(windows), context.space
     with seeded(context.seed):
         predictions = predict(context, window, samples)
         ranks = {name: rank(prediction.samples, prediction.real) for name, prediction in predictions.items()}
@@ -72,12 +72,7 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
     return Section(
         NAME,
         TITLE,
-        EXPLANATION.format(
-            samples=samples,
-            windows=len(episodes),
-            moved=context.moved,
-            scale=length_text(context.space.center_scale, context.space),
-        ),
+        EXPLANATION.format(samples=samples, windows=len(episodes), scale=length_text(space.center_scale, space)),
         conclude(
             level,
             f"What 90 % intervals cover: good if every 95 % interval over episodes lies within {GOOD[0]:.0%} to "

@@ -57,7 +57,6 @@ class CheckContext:
         seed: of everything random. world: in which new episodes are made; None if it is not known. space: its.
         training_episodes, validation_episodes: number of each window's episode `[B]`, by which intervals are clustered;
             without it every window stands for an episode of its own.
-        selection: the options by which training selected windows, such as how far an object had to move.
     """
 
     model: Model
@@ -70,20 +69,11 @@ class CheckContext:
     space: Space = SPACE
     training_episodes: Tensor | None = None
     validation_episodes: Tensor | None = None
-    selection: WindowConfig = field(default_factory=WindowConfig)
 
     @property
     def codes(self) -> tuple[str, ...]:
         """Names of the model's latent sites: effect_code, motion_code, one of them, or none."""
         return self.model.codes
-
-    @property
-    def moved(self) -> str:
-        """Which windows these are, to end a sentence with."""
-        if self.space != SPACE:
-            return "something moved by more than its scale, as in training"
-        least, most = self.selection.minimum_move, self.selection.maximum_move
-        return f"some object moved more than {least:g} m and none more than {most:g} m, as in training"
 
     def held_out(self, number: int) -> tuple[Window, Tensor]:
         """At most `number` of the held-out windows, the same ones each time, and the episode of each `[B]`."""
@@ -112,7 +102,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
     """
     world, on_table = world_of(config), collecting_world(config.env)
-    checkpoint, selection, table, folders = load_trained(config)
+    checkpoint, table, folders = load_trained(config)
     if world is not None:
         check_space(checkpoint, world)
     path, model, guide = checkpoint.path, checkpoint.model, checkpoint.guide
@@ -132,7 +122,6 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
         space=model.space,
         training_episodes=episodes["training"],
         validation_episodes=episodes["validation"],
-        selection=selection,
     )
     own_prior = checkpoint.config["model"].get("prior")
     prior = (own_prior or {}).get("_target_") or (checkpoint.config.get("prior") or {}).get("_target_")
@@ -154,7 +143,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
 
 
 @user_input("checkpoint", "data")
-def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowConfig, WindowTable, list[Path]]:
+def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowTable, list[Path]]:
     """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
 
     Raises:
@@ -175,7 +164,7 @@ def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowConfig, WindowTa
     # What the file says of its parts may be such that they can be built and not run.
     with user_input(where=f"checkpoint {checkpoint.path}"):
         check_compatibility(checkpoint.model, checkpoint.guide, table.batch(table.training[:2]), TraceEnum_ELBO())
-    return checkpoint, selection, table, folders
+    return checkpoint, table, folders
 
 
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:

@@ -35,11 +35,12 @@ COLUMNS = 4
 
 EXPLANATION = (
     "{replicates} datasets were generated from the first states of {windows} held-out windows. These are a "
-    "selection: {moved}. Codes come from the prior (prior predictive) or from the guide, which infers from the whole "
-    'window (posterior predictive). "As sampled" has the noise of the likelihoods; "means" and "as planned" have all '
-    "but the codes at their means, as a planner has it. The tail probability is the share of datasets whose mean is "
-    "at least the observed one: near 0 the model makes too little of it, near 1 too much. Two objects are inside each "
-    "other where their centres are nearer than {pair}, nearer than in all but 1 % of the training windows."
+    "selection: something moved, as in training. Codes come from the prior (prior predictive) or from the guide, which "
+    'infers from the whole window (posterior predictive). "As sampled" has the noise of the likelihoods; "means" and '
+    '"as planned" have all but the codes at their means, as a planner has it. The tail probability is the share of '
+    "datasets whose mean is at least the observed one: near 0 the model makes too little of it, near 1 too much. Two "
+    "objects are inside each other where their centres are nearer than {pair}, nearer than in all but 1 % of the "
+    "training windows."
 )
 TOUCH = (
     " A push touches where its path comes within {tool} of a centre, as often in training windows as pushes move an "
@@ -85,12 +86,7 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     return Section(
         NAME,
         TITLE,
-        EXPLANATION.format(
-            replicates=replicates,
-            windows=len(episodes),
-            moved=context.moved,
-            pair=length_text(nearness.pair, context.space),
-        )
+        EXPLANATION.format(replicates=replicates, windows=len(episodes), pair=length_text(nearness.pair, context.space))
         + (TOUCH.format(tool=length_text(nearness.tool, context.space)) if nearness.tool else ""),
         conclude(
             level,

@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
 from cavin_pyro.criticism.estimates import UNKNOWN, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import NONE, Section, Verdict, conclude, grade, not_applicable
+from cavin_pyro.criticism.windows import NO_CODES, SYMBOLS
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation
@@ -282,20 +282,11 @@ def measure(
         interval over scenes.
     """
     pushes = sum(len(rollout.plan.actions) for rollout in rollouts)
-    finished = [rollout for rollout in rollouts if not rollout.lost]
-    shape = (len(finished), *rollouts[0].before.shape)
-    before, reached, predicted = (
-        np.reshape(states, shape)
-        for states in (
-            [rollout.before for rollout in finished],
-            [rollout.reached for rollout in finished],
-            [rollout.plan.predicted for rollout in finished],
-        )
-    )
+    before, reached, predicted, aim = finished(rollouts)
     moved, error = _lengths(reached - before), _lengths(reached - predicted)
     counted = np.maximum(moved, _lengths(predicted - before)) > moving
     numbers: dict[str, Any] = {
-        "counted": len(finished),
+        "counted": len(before),
         "unsafe": sum(rollout.unsafe for rollout in rollouts) / pushes,
         "ineffective": sum(rollout.ineffective for rollout in rollouts) / pushes,
         "lost": float(np.mean([rollout.lost for rollout in rollouts])),
@@ -304,20 +295,30 @@ def measure(
     }
     if rollouts[0].plan.subgoal is None:
         return numbers
-    subgoal = np.reshape([rollout.plan.subgoal for rollout in finished], shape)
-    way, end = _lengths(subgoal - before), _lengths(reached - subgoal)
+    way, end = _lengths(aim - before), _lengths(reached - aim)
     wanted = way > moving
     left = UNKNOWN
     if wanted.any():
         remaining, whole = (torch.from_numpy((lengths * wanted).sum(-1)) for lengths in (end, way))
-        left = ratio_interval(remaining, whole, torch.arange(len(finished)), seed=seed)
+        left = ratio_interval(remaining, whole, torch.arange(len(way)), seed=seed)
     return numbers | {
         "wanted": _mean(way[wanted]),
         "from_subgoal": _mean(end[wanted]),
-        "predicted_from_subgoal": _mean(_lengths(predicted - subgoal)[wanted]),
+        "predicted_from_subgoal": _mean(_lengths(predicted - aim)[wanted]),
         "from_prediction": _mean(error[wanted]),
         "left": left,
     }
+
+
+def finished(rollouts: Sequence[SubgoalRollout]) -> Floats:
+    """Of the N rollouts in which no object was lost, four states of the objects `[4, N, M, P]`.
+
+    Before and after the actions, as predicted after them, and as wanted: the subgoal, without h what f predicts.
+    """
+    kept = [one for one in rollouts if not one.lost]
+    aims = [one.plan.predicted if one.plan.subgoal is None else one.plan.subgoal for one in kept]
+    states = [(one.before, one.reached, one.plan.predicted, aim) for one, aim in zip(kept, aims, strict=True)]
+    return np.reshape(states, (len(kept), 4, *rollouts[0].before.shape)).swapaxes(0, 1)
 
 
 def _lengths(vectors: Floats) -> Floats:
@@ -350,25 +351,16 @@ def draw_distances(groups: Mapping[str, Sequence[SubgoalRollout]], space: Space 
     figure = Figure(figsize=(8.5, 3.6), layout="constrained")
     shares, moves = figure.subplots(1, 2)
     for color, (name, rollouts) in zip(COLORS, groups.items(), strict=False):
-        finished = [rollout for rollout in rollouts if not rollout.lost]
-        for rollout in finished:
-            states = (rollout.plan.predicted, rollout.reached)
-            moves.plot(*(factor * _lengths(state - rollout.before) for state in states), ".", color=color, alpha=0.5)
-        distances = [wanted_distances(rollout, moving) for rollout in finished]
-        if sum(one.size for one in distances):
-            before, after = factor * np.concatenate(distances, 1)
-            shares.ecdf(after, color=color, label=name)
-            shares.ecdf(before, color=color, linestyle="--", linewidth=0.8)
+        before, reached, predicted, aim = finished(rollouts)
+        moved = (factor * _lengths(state - before).ravel() for state in (predicted, reached))
+        moves.plot(*moved, ".", color=color, alpha=0.5)
+        way, end = factor * _lengths(aim - before), factor * _lengths(reached - aim)
+        if (wanted := way > factor * moving).any():
+            shares.ecdf(end[wanted], color=color, label=name)
+            shares.ecdf(way[wanted], color=color, linestyle="--", linewidth=0.8)
     moves.plot([0, far], [0, far], color="#999999", linewidth=1, linestyle="--")
     labels = {"xlabel": f"by f{unit}", "ylabel": f"moved in the simulator{unit}"}
     moves.set(**labels, xlim=(-far / 60, far), ylim=(-far / 60, far))
     shares.set(xlabel=f"distance to the subgoal{unit}", ylabel="share of objects", xlim=(0, far), ylim=(0, 1))
     shares.legend(fontsize=8, frameon=False, loc="lower right")
     return figure
-
-
-def wanted_distances(rollout: SubgoalRollout, moving: float = MOVING * SPACE.center_scale) -> Floats:
-    """[2, n], of the objects that are to move: to where they should be, before and after the actions."""
-    aim = rollout.plan.predicted if rollout.plan.subgoal is None else rollout.plan.subgoal
-    distances = np.stack([_lengths(aim - state) for state in (rollout.before, rollout.reached)])
-    return distances[:, distances[0] > moving]

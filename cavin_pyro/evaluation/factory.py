@@ -141,28 +141,24 @@ def planner_of(
     """The planner of a configuration; for `model` and errors see `make_planner`."""
     options = {str(name): value for name, value in config.planner.items()}
     options.pop("default_checkpoint", None)  # which `config.checkpoint` has taken, unless the user named another
-    if options.pop("model_free", False):
-        with user_input("planner"):
-            return _with_pushes(config, construct(options, action_dimension=action_dimension))
-    if not isinstance(model, torch.nn.Module):
-        raise UserError(f"{planner_name(config)} needs a model: give cavin_pyro.load(NAME).model, or planner=random")
-    pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
-    _check_planner(options, model.to(device))
-    if options.get("feature_weight", 0.0) is None:  # features count as much as positions, by the likelihood's scales
-        options["feature_weight"] = (model.space.center_scale / model.space.feature_scale) ** 2
-    if options.get("compile") is True and device.type == "cuda":
-        options["compile"] = GRAPHS
-    torch.manual_seed(config.seed)
-    optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
-    given = {"model": model, "additions": additions, "decimals": config.get("push_decimals"), **optimizers}
+    given: dict[str, Any] = {"action_dimension": action_dimension}
+    if not options.pop("model_free", False):
+        if not isinstance(model, torch.nn.Module):
+            name = planner_name(config)
+            raise UserError(f"{name} needs a model: give cavin_pyro.load(NAME).model, or planner=random")
+        pyro.settings.set(validate_distributions_pyro=False, validate_distributions_torch=False)
+        _check_planner(options, model.to(device))
+        if options.get("feature_weight", 0.0) is None:  # features count as positions do, by the likelihood's scales
+            options["feature_weight"] = (model.space.center_scale / model.space.feature_scale) ** 2
+        if options.get("compile") is True and device.type == "cuda":
+            options["compile"] = GRAPHS
+        torch.manual_seed(config.seed)
+        optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
+        given = {"model": model, "additions": additions, "decimals": config.get("push_decimals"), **optimizers}
     with user_input("planner"):
-        return _with_pushes(config, construct(options, **given))
-
-
-def _with_pushes(config: DictConfig, planner: Planner) -> Planner:
-    """The planner, whose plans have as many pushes as are to be executed, or a `UserError`."""
-    if config.pushes_per_plan is not None:
-        check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
+        planner: Planner = construct(options, **given)
+        if config.pushes_per_plan is not None:  # a plan has as many pushes as are to be executed
+            check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
     return planner
 
 

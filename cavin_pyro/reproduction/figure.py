@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 
 from cavin_pyro.reproduction.cells import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.reproduction.methods import METHODS, Method
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 
-DOTS_PER_INCH = 120
 GROUP_WIDTH = 0.8  # of the bars of all methods side by side
 DODGE = 0.06  # of lines whose whiskers would lie on one another, in objects
 TITLES = {"paper": "planners as in the paper", "ours": "planners with our additions"}
@@ -41,8 +40,7 @@ def draw_figure(path: Path, rates: pd.DataFrame, *, planner: str, criterion: str
     handles, labels = axes[1][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 2 * len(tasks)), frameon=False)
     figure.suptitle(f"{TITLES[planner]}; criterion: {criterion}", fontsize=10)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, facecolor="white", metadata={"Software": None})
+    save_figure(path, figure)
 
 
 def _draw_rewards(axes: Axes, rates: pd.DataFrame) -> None:

@@ -116,7 +116,7 @@ class PushT(World):
         turning=True,
         frequencies=4,
     )
-    features, objects = 2, 2
+    features, objects, names = 2, 2, ["T", ""]
 
     def __init__(
         self,
@@ -237,11 +237,6 @@ class PushT(World):
         return np.asarray(centers, dtype=np.float64) * (PICTURE / SIZE)
 
     @property
-    def names(self) -> list[str]:
-        """See `World`."""
-        return ["T", ""]
-
-    @property
     def landmarks(self) -> dict[str, NDArray[np.floating]]:
         """See `World`."""
         return {"goal": self.pose[2:4]}
@@ -253,7 +248,8 @@ class PushT(World):
     def coverage(self) -> float:
         """The part of the goal's area that the block covers, from 0 to 1."""
         block = self._simulator.block
-        shapes = [self._module.pymunk_to_shapely(body, block.shapes) for body in (block, self._goal_body())]
+        goal = self._simulator.get_goal_pose_body(self.pose[2:])
+        shapes = [self._module.pymunk_to_shapely(body, block.shapes) for body in (block, goal)]
         return float(shapes[0].intersection(shapes[1]).area / shapes[1].area)
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -278,9 +274,6 @@ class PushT(World):
         distance, angle = (COVERAGE_DISTANCE, COVERAGE_ANGLE) if block_alone else (POSE_DISTANCE, POSE_ANGLE)
         limits = {"distance": margin * distance, "angle": margin * angle}
         return PoseGoal(self.space, pose, **limits, disc=not block_alone, weight=weight)
-
-    def _goal_body(self) -> Any:
-        return self._simulator.get_goal_pose_body(self.pose[2:])
 
     def _set(self, state: NDArray[np.float64]) -> None:
         """Put disc and block (5 or 7 numbers) into a fresh space; whatever is set, it has the same past."""

@@ -99,11 +99,6 @@ class Scene(Uncopied):
         self.objects: list[ObjectParameters] = []
         self.bodies: list[int] = []
 
-    @property
-    def camera(self) -> Camera:
-        """The nominal camera, which takes the pictures for people."""
-        return self.sensor.nominal
-
     def close(self) -> None:
         """Free the simulator. Closing twice is harmless."""
         self.world.close()
@@ -197,7 +192,7 @@ class Scene(Uncopied):
         return self._observe(self.segmenter.follow)
 
     def _observe(self, segment: Callable[[DepthImage], list[Pixels]]) -> Observation:
-        if not self.robot.clear_of_view(self.camera):
+        if not self.robot.clear_of_view(self.sensor.nominal):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
         image = self.capture()
         return self._latest_clouds.update(image, segment(image))

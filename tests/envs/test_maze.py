@@ -78,10 +78,3 @@ def test_a_wall_stops_the_ball_and_the_goal_ends_the_episode(env: Maze) -> None:
 def test_what_it_cannot_be_is_one_line(options: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Maze(**options)
-
-
-@pytest.mark.parametrize("action", [[0.0], [np.nan, 0.0]])
-def test_an_action_is_two_finite_numbers(env: Maze, action: list[float]) -> None:
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="2 finite numbers"):
-        env.step(np.array(action))

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.envs.tabletop.sensors.kinect2 import Kinect2
-from cavin_pyro.envs.tabletop.sensors.sensor import (
-    DepthImage,
-    DepthSensor,
-    IdealSensor,
-    Renderer,
-    Rendering,
-    SensorFactory,
-)
+from cavin_pyro.envs.tabletop.sensors.sensor import DepthImage, DepthSensor, IdealSensor, Renderer, Rendering
 from cavin_pyro.models.checks import check_choice
 
-CAMERAS: dict[str, SensorFactory] = {"ideal": IdealSensor, "kinect2": Kinect2}
+CAMERAS: dict[str, Callable[[], DepthSensor]] = {"ideal": IdealSensor, "kinect2": Kinect2}
 
 
 def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:

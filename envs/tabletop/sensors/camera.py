@@ -87,13 +87,7 @@ class Camera:
         """Pixel coordinates (column, row) [..., 2] of points [..., 3] metres; (0, 0) is the upper left corner."""
         offsets = (np.asarray(points, dtype=np.float64) - np.array(self.position)) @ self.axes.T
         along_row, along_column, column, row = self.intrinsics
-        return np.stack(
-            [
-                offsets[..., 0] / offsets[..., 2] * along_row + column,
-                offsets[..., 1] / offsets[..., 2] * along_column + row,
-            ],
-            axis=-1,
-        )
+        return offsets[..., :2] / offsets[..., 2:] * (along_row, along_column) + (column, row)
 
 
 def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -54,7 +53,7 @@ class DepthSensor(Protocol):
 
     @property
     def nominal(self) -> Camera:
-        """The nominal camera, which takes the pictures for people."""
+        """The nominal camera, in whose view no robot may stand."""
         ...
 
     def reset(self, generator: np.random.Generator) -> None:
@@ -82,6 +81,3 @@ class IdealSensor:
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         rendering = render(self.nominal)
         return DepthImage(rendering.depth, self.nominal), rendering.bodies
-
-
-SensorFactory = Callable[[], DepthSensor]

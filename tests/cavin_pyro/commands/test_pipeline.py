@@ -14,7 +14,6 @@ import yaml
 
 from cavin_pyro.config.options import flat_options
 from cavin_pyro.data.dataset import read_metadata
-from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.storage.checkpoint import load
 
 # A task that nobody has seen: an L-shaped bridge.
@@ -100,12 +99,10 @@ def test_a_plan_tells_its_pushes(chain: SimpleNamespace) -> None:
     assert f"\ncrossing: {results['outcome']} after {results['steps']} pushes" in said
 
 
-def test_an_evaluation_has_rates_with_intervals_and_the_episodes_of_plan(chain: SimpleNamespace) -> None:
+def test_an_evaluation_has_finite_numbers_and_the_episodes_of_plan(chain: SimpleNamespace) -> None:
     results = json.loads((chain.folder / "evaluation" / "results.json").read_text())
     episodes = results["per_episode"]
     assert [episode["seed"] for episode in episodes] == [6, 7]
-    for name in ("success", "violation", "fall", "timeout"):
-        assert results[name] == wilson(sum(episode["outcome"] == name for episode in episodes), 2)
     assert all(math.isfinite(value) for name in ("planning_ms", "steps", "return") for value in results[name].values())
     assert chain.answers["evaluate"].output.startswith((chain.folder / "evaluation" / "results.txt").read_text())
     alone = json.loads((chain.folder / "episode" / "results.json").read_text())

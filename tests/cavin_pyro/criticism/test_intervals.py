@@ -49,8 +49,5 @@ def test_all_parts_of_a_cascade_are_covered_and_repeatable(right: SimpleNamespac
     states = [f"{part} {what}" for part in ("f", "h_prior", "h_guide") for what in ("centres", "moved", "features")]
     assert list(section.values["predictions"]) == [*states, "g_guide pushes"]
     assert str(assess_intervals(context, windows=30, samples=6).values) == str(section.values)
-
-
-def test_a_model_of_dynamics_alone_is_checked_for_what_it_has(right: SimpleNamespace) -> None:
-    section = assess_intervals(right.dynamics, windows=30, samples=6)
-    assert list(section.values["predictions"]) == ["f centres", "f moved", "f features"]
+    alone = assess_intervals(right.dynamics, windows=30, samples=6)
+    assert list(alone.values["predictions"]) == ["f centres", "f moved", "f features"]

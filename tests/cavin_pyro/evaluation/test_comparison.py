@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from math import comb
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.comparison import compare, write_page
-from cavin_pyro.evaluation.statistics import mcnemar, wilson
+from cavin_pyro.evaluation.statistics import wilson
 
 COUNTS = ["scenes", "first better", "this better"]
 
@@ -36,13 +33,6 @@ def test_scenes_of_both_are_counted_by_the_methods_that_solve_them() -> None:
     found = compare(one, ended([True, False, False, True, False, True]))
     assert found.loc["method 2", COUNTS].tolist() == [6, 2, 1]
     assert compare(ended([True] * 5), ended([False] * 5, first=3)[::-1])["p"].iloc[1] == 0.5
-
-
-@given(st.integers(0, 20), st.integers(0, 20))
-def test_the_test_is_the_binomial_one_of_the_scenes_that_only_one_solves(alone: int, others: int) -> None:
-    count = alone + others
-    lower = sum(comb(count, k) for k in range(min(alone, others) + 1)) / 2**count
-    assert math.isclose(mcnemar(alone, others), min(1.0, 2 * lower))
 
 
 def test_tables_of_other_programs_have_intervals_and_a_page(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.evaluation.evaluation import episode_row, run_missing
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
-from cavin_pyro.evaluation.rollout import OUTCOMES, Episode, EpisodeCallback, PlanRecord, Transition
+from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
 from cavin_pyro.models.networks.pointnet import PointNet
 from cavin_pyro.planning import CavinPlanner, Plan, RandomPlanner
 from cavin_pyro.planning.rollout import project
@@ -105,23 +105,15 @@ class Listener(EpisodeCallback):
         self.ended.append(episode)
 
 
-def test_an_episode_plans_at_its_start_and_after_every_segment(env: PushingEnv) -> None:
+def test_callbacks_hear_of_all_that_happens_in_its_order(env: PushingEnv) -> None:
     listener = Listener()
     episode = rollout(env, RandomPlanner(action_dimension=4), seed=0, callbacks=[listener, EpisodeCallback()])
-    called = listener.plans
-    assert called == episode.plan_records
+    assert listener.plans == episode.plan_records
     assert listener.transitions == episode.transitions
     assert len(listener.observations) == len(episode.transitions) + 1
     assert listener.ended == [episode]
     assert (listener.frames > 0) == any(not transition.unsafe for transition in episode.transitions)
-    assert [record.step for record in episode.plan_records] == [0, 3][: len(called)]
     assert [transition.step for transition in episode.transitions] == list(range(1, len(episode.transitions) + 1))
-    for transition in episode.transitions:
-        record = episode.plan_records[(transition.step - 1) // 3]
-        planned = record.plan.actions[0, (transition.step - 1) % 3]
-        np.testing.assert_array_equal(transition.action, project(planned, 3))
-    assert episode.outcome in OUTCOMES
-    assert episode.total_reward == sum(transition.reward for transition in episode.transitions)
 
 
 def test_an_episode_does_not_depend_on_how_a_machine_rounds(env: PushingEnv) -> None:
@@ -227,8 +219,9 @@ def parts(runner: EpisodeRunner) -> SimpleNamespace:
 
 
 def test_options_reach_the_parts(configure: Any) -> None:
-    runner = parts(make_runner(configure(*fast("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7"))))
-    assert isinstance(runner.planner, CavinPlanner)
+    chosen = ("task=insertion", "reward=dense", "margin=0.02", "maximum_steps=7", "matmul_precision=bfloat16")
+    runner = parts(make_runner(configure(*fast(*chosen))))
+    assert isinstance(runner.planner, CavinPlanner) and torch.get_float32_matmul_precision() == "medium"
     assert (runner.planner.samples, runner.planner.segments) == (8, 2)
     assert runner.env.name == "insertion" and runner.reward.task == runner.env.task
     assert runner.reward.dense and runner.env.reward.dense

@@ -37,16 +37,6 @@ MODELS = sorted({*FITTING.values()})
 SMALL = ["maximum_steps=3", "objects=2", "planner.samples=16", "planner.horizon=6"]
 
 
-def multiplies_in_bfloat16() -> bool:
-    """Whether this processor rounds products to bfloat16 where torch may: not all have instructions for it."""
-    left, right = torch.rand(2, 512, 512, generator=torch.Generator().manual_seed(0))
-    exact = left @ right
-    torch.set_float32_matmul_precision("medium")
-    rounded = left @ right
-    torch.set_float32_matmul_precision("highest")
-    return not torch.equal(exact, rounded)
-
-
 def save_untrained(path: Path, *further: str) -> Path:
     """A very small checkpoint, as train writes it."""
     composed = compose("train", "guide=none", "model.width=8", *further)
@@ -113,11 +103,6 @@ def test_every_planner_plans_with_every_optimizer(
         # perturbed rollouts are made of plans that reach the goal: here some do
         ("cavin_without_effects task=clearing planner.horizon=30 objects=1", "planner.drop=[perturbed_rollouts]"),
         ("cvae_mpc task=clearing planner.horizon=30", "planner.drop=[perturbed_rollouts]"),
-        pytest.param(
-            "cavin",
-            "matmul_precision=bfloat16",
-            marks=pytest.mark.skipif(not multiplies_in_bfloat16(), reason="the processor has no bfloat16"),
-        ),
     ],
 )
 def test_options_take_effect(planner: str, option: str) -> None:

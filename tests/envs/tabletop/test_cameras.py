@@ -16,14 +16,6 @@ from cavin_pyro.envs.tabletop.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
 from cavin_pyro.envs.tabletop.sensors.kinect2 import CALIBRATION, NOMINAL, RESOLUTION, VIEWPOINT, Perturbation
 
 
-def test_the_images_up_is_x_and_its_left_is_y() -> None:
-    camera = Camera()
-    middle, up, left = camera.project(np.array([[0.6, 0.0, 0.0], [0.7, 0.0, 0.0], [0.6, 0.1, 0.0]]))
-    np.testing.assert_allclose(middle, [camera.width / 2, camera.height / 2])
-    assert up[1] < middle[1] and up[0] == middle[0]
-    assert left[0] < middle[0] and left[1] == middle[1]
-
-
 def test_points_of_boxes_lie_neither_too_far_to_a_side_nor_too_far_ahead(scene: Scene, put: Callable) -> None:
     errors = []
     for number in range(20):

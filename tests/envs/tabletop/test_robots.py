@@ -117,7 +117,7 @@ def test_a_push_against_what_cannot_move_is_blocked_and_ends_retracted(
     scene.reset([anvil], np.random.default_rng(0))
     report = scene.push(push(0.47, 0.0, 0.1, 0.0))
     assert report.stopped == "blocked" and report.moved[0] < 0.01
-    assert scene.robot.clear_of_view(scene.camera)
+    assert scene.robot.clear_of_view(scene.sensor.nominal)
     assert scene.observe().visible[0]
 
 
