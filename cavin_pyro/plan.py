@@ -19,6 +19,11 @@ def main(config: DictConfig) -> Figures:
     from cavin_pyro.storage.run_directory import check_same_run, write_config
     from cavin_pyro.visualization.rendering import episode_files, render_episode
 
+    if config.viewer == "live":
+        from cavin_pyro.visualization.live_page import serve
+
+        serve(config)
+        return {}
     config.device = choose_device(config.device).type
     with output_folder(config.output) as folder:
         check_same_run(folder, config, ignore=("output", "video", "video_format", "planner.compile"))

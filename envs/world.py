@@ -100,6 +100,14 @@ class World(gymnasium.Env[Any, NDArray[np.float32]], ABC):
     def check_starts(self, seed: int) -> None:
         """Begin an episode of each kind that there is; raises ValueError where none can begin."""
 
+    def goals(self) -> NDArray[np.float64]:
+        """The goals that can be moved by hand: (x, y), or (x, y, radians) of each; by default none."""
+        return np.zeros((0, 2))
+
+    def move_goals(self, goals: NDArray[np.float64]) -> None:
+        """Move all `goals` within the episode; a ValueError says why one cannot lie there."""
+        raise ValueError(f"the goal of {self.name} cannot be moved")
+
     def observed(self, observation: Any) -> Any:
         """What additions to planners read besides the state: a named tuple of tensors `[1, ...]`; by default None."""
         return None

@@ -93,7 +93,7 @@ def test_one_version_is_named_everywhere() -> None:
 
 def test_every_dependency_is_locked_at_a_version_that_the_project_admits() -> None:
     extras = PROJECT["project"]["optional-dependencies"]
-    optional = [one for name in ("test", "assets", "docs", "maze", "pusht", "slurm") for one in extras[name]]
+    optional = [one for name in ("test", "assets", "docs", "live", "maze", "pusht", "slurm") for one in extras[name]]
     locked = lock()
     for one in ranges(PROJECT["project"]["dependencies"] + optional):
         assert one.name in locked and locked[one.name] in one.specifier, str(one)
@@ -102,7 +102,7 @@ def test_every_dependency_is_locked_at_a_version_that_the_project_admits() -> No
 def test_every_import_of_a_third_party_is_a_dependency_of_the_project() -> None:
     # What an optional extra brings is imported only on request.
     extras = PROJECT["project"]["optional-dependencies"]
-    optional = [one for name in ("assets", "maze", "minari", "pusht") for one in extras[name]]
+    optional = [one for name in ("assets", "live", "maze", "minari", "pusht") for one in extras[name]]
     declared = {one.name for one in ranges(PROJECT["project"]["dependencies"] + optional)}
     known = {*sys.stdlib_module_names, "cavin_pyro"}
     strangers = [

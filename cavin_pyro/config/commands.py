@@ -274,6 +274,8 @@ class PlanConfig(EpisodeConfig):
     output: str | None = option(None, "folder for the results; by default one in runs/")
     video: bool = option(True, "write a video of the episode")
     video_format: str = option("mp4", "of the video; gif and webp move on web pages", choices=("mp4", "gif", "webp"))
+    viewer: str = option("none", "live: a page on which the goal is moved by hand", choices=("none", "live"))
+    port: int = option(8080, "where viewer=live listens, on 127.0.0.1 alone; 0: any", minimum=0, maximum=65535)
 
 
 @dataclass

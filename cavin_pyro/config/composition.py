@@ -34,7 +34,7 @@ OUTPUT = {  # the folder of a run for which the user names none
     "reproduce": "runs/reproduce/{scale}",
 }
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
-SAME_RUN = {"output", "workers", "transitions", "sections", "video", "video_format", "episodes"}
+SAME_RUN = {"output", "workers", "transitions", "sections", "episodes", "video", "video_format", "viewer", "port"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
 PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "export", "models", "table", "env.assets")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")

@@ -145,6 +145,7 @@ def rollout(
     photograph: bool = False,
     callbacks: Sequence[EpisodeCallback] = (),
     device: str | torch.device = "cpu",
+    start: Any = None,
 ) -> Episode:
     """Run one episode in a world.
 
@@ -162,6 +163,7 @@ def rollout(
             does not depend on how a machine rounds; None executes them as planned.
         photograph: keep a picture with every plan.
         callbacks: called in this order; without any, no frame is computed.
+        start: an observation of the world, to go on from there; by default it is reset.
         device: of the planner's model. Records of plans are on the CPU, as is the planner's randomness.
 
     Raises:
@@ -178,7 +180,7 @@ def rollout(
     generator = torch.Generator().manual_seed(planner_seed(seed))
     env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
     with _refusals(seed, env):
-        observation, _ = env.reset(seed=seed)
+        observation = env.reset(seed=seed)[0] if start is None else start
         goal = env.goal(device)
     for callback in callbacks:
         callback.on_observation(observation)

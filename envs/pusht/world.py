@@ -228,6 +228,19 @@ class PushT(World):
         """See `World`. For coverage the block alone has to be near the goal's pose."""
         return self._goal(self.pose, margin=self._margin, weight=self._weight)
 
+    def goals(self) -> NDArray[np.float64]:
+        """See `World`: the block's pose."""
+        return self.pose[None, 2:].copy()
+
+    def move_goals(self, goals: NDArray[np.float64]) -> None:
+        """See `World`: the disc's place at the goal moves with the block's, and stays in the window."""
+        block = np.array(goals[0], dtype=np.float64)
+        corners = outline_of(np.array([0.0, 0.0, *block]))
+        if not ((corners > 0) & (corners < SIZE)).all():
+            raise ValueError("the goal of the T must lie within the walls")
+        disc = block[:2] + rotation(float(block[2] - self.pose[4])) @ (self.pose[:2] - self.pose[2:4])
+        self.pose = np.array([*disc.clip(WALLS[0] + RADIUS, WALLS[1] - RADIUS), *block])
+
     def policy(self, generator: np.random.Generator) -> PushTPolicy:
         """See `World`."""
         return PushTPolicy(generator)

@@ -288,6 +288,18 @@ class PushingEnv(Uncopied, World):
             known[key] = TaskReward(self.task, reward=self._rules[0], margin=self.margin, device=device)
         return known[key]
 
+    def goals(self) -> NDArray[np.float64]:
+        """See `World`."""
+        return self.task.goals()
+
+    def move_goals(self, goals: NDArray[np.float64]) -> None:
+        """See `World`: by whole tiles, where the goal is made of them."""
+        assert self._observation is not None
+        target = self._observation.centers[0, :2]
+        self._begin(self.task.moved(goals, (float(target[0]), float(target[1]))))
+        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
+        self.scene.places = self.task.object_places() if self.show_tiles else ()
+
     def close(self) -> None:
         """Free the simulator."""
         self.scene.close()

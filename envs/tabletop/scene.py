@@ -194,7 +194,7 @@ class Scene(Uncopied):
     def _observe(self, segment: Callable[[DepthImage], list[Pixels]]) -> Observation:
         if not self.robot.clear_of_view(self.sensor.nominal):
             raise RuntimeError("the robot stands in the camera's view: nothing can be seen behind it")
-        image = self.capture()
+        self.image = image = self.capture()
         return self._latest_clouds.update(image, segment(image))
 
     def _find_objects(self, image: DepthImage) -> list[Pixels]:

@@ -38,6 +38,7 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     " -m pip ": "needs the network",
     "cavin_pyro.assets": "needs the network; tests/cavin_pyro/fetching runs it on small archives",
     "env.assets=": "needs files from publishers",
+    "viewer=live": "runs until Ctrl-C; tests/cavin_pyro/visualization runs it",
     "maze": "needs an extra; tests/envs runs it",
     "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
     "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",

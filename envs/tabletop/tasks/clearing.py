@@ -24,6 +24,7 @@ class Clearing(Task):
     """
 
     markings = (Marking("region", "to clear", "#0072B2", 0.35),)
+    movable = "region"
     about = "all"
 
     region: TileSet

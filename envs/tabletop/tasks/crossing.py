@@ -24,6 +24,7 @@ class Crossing(Task):
     """
 
     markings = (Marking("region", "bridge", "#5A5A5A", 0.35), GOAL_MARKING)
+    movable = "goal"
 
     region: TileSet
     goal: TileSet

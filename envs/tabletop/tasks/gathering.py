@@ -22,6 +22,7 @@ class Gathering(Task):
     """
 
     markings = (Marking("region", "gather here", "#F2C200", 0.50),)
+    movable = "region"
     about = "all"
 
     region: TileSet

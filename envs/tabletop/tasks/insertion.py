@@ -31,6 +31,7 @@ class Insertion(Task):
     """
 
     markings = (Marking("region", "keep out", "#C2272D", 0.40), GOAL_MARKING)
+    movable = "goal"
 
     region: TileSet
     goal: TileSet

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cavin_pyro.envs.tabletop.markings import Place
@@ -66,6 +67,14 @@ class Rearrange(Task):
             count = len(self.places)
             raise ValueError(f"task.places: number of places is {count}, of objects {objects}: use objects={count}")
         return self
+
+    def goals(self) -> NDArray[np.float64]:
+        """The places."""
+        return np.array(self.places).reshape(-1, 2)
+
+    def moved(self, goals: NDArray[np.float64], target: Place) -> Rearrange:
+        """See `Task`: to any points on the table."""
+        return replace(self, places=goals.tolist())
 
     def object_places(self) -> tuple[Place, ...]:
         """The places, in the order of objects."""

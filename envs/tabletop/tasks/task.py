@@ -16,13 +16,14 @@ from typing import ClassVar, Literal, NamedTuple, TypeVar, get_type_hints
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cavin_pyro.envs.tabletop.markings import Place, TileGroup
 from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.tasks.generated import GeneratedLayouts
 from cavin_pyro.envs.tabletop.tasks.tiles import TileSet, box_distance, parse_tiles
-from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, Tile
+from cavin_pyro.envs.tabletop.workspace import REACH_HIGH, REACH_LOW, TILE_ORIGIN, TILE_SIDE, Tile, tile_center
 
 STILL = 0.005  # metres; what moves by less is taken to stay where it is
 
@@ -130,6 +131,7 @@ class Task(ABC):
             guidance follows their way, and for `all` the planner may track the first push.
         maximum_return: upper bound on sparse returns; a task that adds positive terms sets `math.inf`.
         goal_is_shared: whether one place is as good for each object as for another; else guidance follows `potential`.
+        movable: the field with the goal's tiles, which a person may move during an episode; "": none.
         target_start, obstacle_start: tiles on which objects start.
 
     Raises:
@@ -141,6 +143,7 @@ class Task(ABC):
     about: ClassVar[Literal["target", "all"]] = "target"
     maximum_return: ClassVar[float] = GOAL_REWARD + TIME_REWARD
     goal_is_shared: ClassVar[bool] = True
+    movable: ClassVar[str] = ""
 
     target_start: TileSet
     obstacle_start: TileSet
@@ -223,6 +226,29 @@ class Task(ABC):
             observation: the episode's first. generator: for the goal alone, so that scenes do not depend on the task.
         """
         return self
+
+    def goals(self) -> NDArray[np.float64]:
+        """The middle of the tiles of `movable`, (x, y) metres: [1, 2]; none if it names none."""
+        tiles = getattr(self, self.movable) if self.movable else ()
+        return np.mean([tile_center(tile) for tile in tiles], axis=0, keepdims=True) if tiles else np.zeros((0, 2))
+
+    def moved(self: Self, goals: NDArray[np.float64], target: Place) -> Self:
+        """This task with its goal moved during an episode, by whole tiles; `target`: where the target is.
+
+        Raises:
+            ValueError: tiles would be off the table, or contradict others.
+        """
+        if not self.movable:
+            raise ValueError(f"the goal of {self.name} cannot be moved")
+        along, across = np.rint((goals - self.goals())[0] / TILE_SIDE).astype(int).tolist()
+        tiles = [(i + along, j + across) for i, j in getattr(self, self.movable)]
+        here = np.rint((np.array(target) - TILE_ORIGIN) / TILE_SIDE).astype(int).tolist()
+        other = copy.copy(self)
+        object.__setattr__(other, self.movable, TileSet(parse_tiles(tiles, self.movable)))
+        if self.about == "target":
+            object.__setattr__(other, "target_start", TileSet([(here[0], here[1])]))
+            other.check()
+        return other
 
     def object_places(self) -> tuple[Place, ...]:
         """Where on the table each object has to go, in the order of objects, for pictures; by default nowhere."""
