@@ -18,7 +18,7 @@ def test_each_world_has_at_most_60_lines() -> None:
     assert len(FILES) == 3 and max(map(len, (text.splitlines() for text in FILES.values()))) <= 60
 
 
-@pytest.mark.parametrize(("name", "options", "steps"), [("Pendulum", {"hanging": False}, 1000), ("Point", {}, 600)])
+@pytest.mark.parametrize(("name", "options", "steps"), [("Pendulum", {"hanging": False}, 800), ("Point", {}, 300)])
 def test_a_world_is_learned_and_its_goals_are_reached(
     name: str, options: dict[str, bool], steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,7 @@ from tests.docs.pages import FENCE, PAGES, ROOT, Line, commands, name
 
 EPISODES = "maximum_steps=2 planner.samples=16"
 SMALL = {  # options that make each command a matter of a second
-    "collect": "transitions=60 seed=4 steps=6 episodes_per_shard=4 workers=1",
+    "collect": "transitions=30 seed=6 steps=6 episodes_per_shard=2 workers=1",
     "pretrain": "steps=2 batch_size=4 clouds=40",
     "train": "model.width=8 trainer.steps=2 trainer.validate_every=1 trainer.batch_size=4 trainer.validation_windows=8 "
     "windows.minimum_move=0.001 windows.validation_fraction=0.4",

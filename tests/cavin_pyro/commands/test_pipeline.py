@@ -29,7 +29,7 @@ EPISODE = (
     "pushes_per_plan=null"
 )
 LINES = {
-    "collect": "transitions=60 steps=6 episodes_per_shard=4 workers=2 seed=3 output=pushes",
+    "collect": "transitions=60 steps=6 episodes_per_shard=4 workers=1 seed=3 output=pushes",
     "pretrain": "data=pushes steps=3 clouds=40 batch_size=8 output=features",
     "train": "data=pushes pointnet=features/pointnet.safetensors output=run model.width=8 guide.width=8 "
     "trainer.steps=4 trainer.validate_every=2 trainer.batch_size=8 windows.minimum_move=0.005 "
