@@ -184,9 +184,18 @@ class SearchingPlanner(ABC):
         return self.search(space, objective, scene, early_stopping=self.early_stopping)
 
     def added(self, hook: str, value: Value, *arguments: Any) -> Value:
-        """A value after every addition's `hook(value, *arguments)`, in the order in which they act."""
+        """A value after every addition's `hook(value, *arguments)`, in the order in which they act.
+
+        Raises:
+            ValueError: an addition returned another kind of value, or another shape.
+        """
         for addition in self.additions:
-            value = getattr(addition, hook)(value, *arguments)
+            before, value = value, getattr(addition, hook)(value, *arguments)
+            if isinstance(before, Tensor) and getattr(value, "shape", None) != before.shape:
+                given = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
+                raise ValueError(
+                    f"{type(addition).__name__}.{hook} must return shape {list(before.shape)}, not {given}"
+                )
         return value
 
 

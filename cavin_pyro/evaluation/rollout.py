@@ -204,7 +204,7 @@ def rollout(
             mask=mask,
             plan=plan,
             milliseconds=1e3 * (time.perf_counter() - began),
-            photograph=env.render() if photograph else None,
+            photograph=_picture(env, seed) if photograph else None,
         )
         episode.plan_records.append(record)
         for callback in callbacks:
@@ -238,7 +238,7 @@ def rollout(
                 episode.outcome = _end(ends) or "timeout"
                 break
     if photograph:
-        episode.photograph = env.render()
+        episode.photograph = _picture(env, seed)
     for callback in callbacks:
         callback.on_end(episode)
     return episode
@@ -256,6 +256,17 @@ def _refusals(seed: int, part: World | Planner) -> Iterator[None]:
         raise UserError(str(error)) from error
     except NoRoomError as error:
         raise UserError(f"seed={seed}: {error}") from error
+
+
+def _picture(env: World, seed: int) -> NDArray[np.uint8] | None:
+    with _refusals(seed, env):
+        picture = env.render()
+    if picture is not None and (np.ndim(picture), getattr(picture, "dtype", None)) != (3, np.uint8):
+        kind = f"{type(env).__name__}.render"
+        raise UserError(
+            f"{kind} must return a picture [height, width, 3] of uint8, or None, not {type(picture).__name__}"
+        )
+    return picture
 
 
 def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:

@@ -200,8 +200,8 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
     Raises:
         UserError: missing, truncated, damaged or foreign file, another version, or a class of an untrusted module.
     """
-    if isinstance(trust, str):  # a sequence too, of letters
-        raise UserError(f'trust must be a list of modules, ["{trust}"] in Python, not "{trust}"')
+    if isinstance(trust, str) or not isinstance(trust, Sequence):  # a word is a sequence too, of letters
+        raise UserError(f'trust must be a list of modules, such as ["my_lab"] in Python, not {trust!r}')
     path = find_checkpoint(name_or_path)
     header, tensors = read_checkpoint(path)
     with user_input(where=f"checkpoint {path} has a damaged header"):

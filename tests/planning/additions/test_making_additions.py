@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from torch import Tensor
@@ -40,6 +42,18 @@ def test_a_users_own_addition_changes_plans(
         plan = planner.plan(state, reward=reward, generators=toy.generators(*range(8)))
         pushes.append(plan.actions[..., 2:].norm(dim=-1).amax(-1).mean())
     assert pushes[1] < 0.9 * pushes[0]
+
+
+@pytest.mark.parametrize("wrong", [lambda scores: scores[..., None], lambda scores: 3.0])
+def test_scores_of_another_shape_are_refused(toy: SimpleNamespace, wrong: Callable[[Tensor], Any]) -> None:
+    class Wrong(Addition):
+        def rank(self, scores: Tensor, choice: Choice) -> Any:
+            return wrong(scores)
+
+    planner = CavinPlanner(toy.PointMass(), samples=4, horizon=6, additions=[Wrong()])
+    state, reward = toy.scenes([[(0.0, 0.0)]]), toy.GoalDisc(goal=(9.0, 0.0), dense=True)
+    with pytest.raises(ValueError, match=r"^Wrong\.rank must return shape \[1, 4\], not "):
+        planner.plan(state, reward=reward, generators=toy.generators(0))
 
 
 def test_additions_act_in_one_order_however_they_are_listed(toy: SimpleNamespace) -> None:
