@@ -27,11 +27,11 @@ def _run() -> None:
         parser.error("give at least one RUN, and each --method NAME once")
     if line.output.suffix != ".html" or not line.output.parent.is_dir():
         parser.error(f"--output {line.output} must be FILE.html, in a folder that is there")
-    from cavin_pyro.evaluation.comparison import compare, write_page
+    from cavin_pyro.evaluation.comparison import as_text, compare, write_page
 
     table = compare(*line.runs, **named)
     write_page(line.output, table)
-    print(f"{table.to_string(na_rep='', float_format='{:.2g}'.format)}\n{line.output}")
+    print(f"{as_text(table)}\n{line.output}")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from cavin_pyro.config.application import DictConfig, Figures, command
+from collections.abc import Mapping
+
+from cavin_pyro.config.application import DictConfig, Figures, command, figures_table
+from cavin_pyro.config.errors import UserError
 
 
-@command("evaluate")
+def compared(found: Mapping[str, Figures]) -> str:
+    """What `python -m cavin_pyro.compare` says of a sweep's runs, if they met the same scenes."""
+    from cavin_pyro.evaluation.comparison import as_text, compare
+
+    try:
+        return as_text(compare(**{name: [figures["folder"]] for name, figures in found.items()}))
+    except UserError:
+        return figures_table(found)
+
+
+@command("evaluate", compared)
 def main(config: DictConfig) -> Figures:
     """Run seeded episodes and report rates with their intervals; resumes an interrupted run."""
     from pathlib import Path
@@ -14,7 +27,11 @@ def main(config: DictConfig) -> Figures:
 
     results, folder = evaluate(config), Path(config.output)
     print(f"{(folder / 'results.txt').read_text(encoding='utf-8')}written: {folder / 'results.json'}")
-    return {"success": f"{100 * results['success']['rate']:.1f} %", "episodes": results["episodes"]}
+    return {
+        "success": f"{100 * results['success']['rate']:.1f} %",
+        "episodes": results["episodes"],
+        "folder": str(folder),
+    }
 
 
 if __name__ == "__main__":

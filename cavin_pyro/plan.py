@@ -26,7 +26,7 @@ def main(config: DictConfig) -> Figures:
         return {}
     config.device = choose_device(config.device).type
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "video", "video_format", "planner.compile"))
+        check_same_run(folder, config, ignore=("output", "video", "video_format", "viewer", "port", "planner.compile"))
         video = config.video_format if config.video else None
         runner = make_runner(copy.deepcopy(config), render=True)
         write_config(folder, config)

@@ -41,9 +41,18 @@ T = TypeVar("T")
 Figures = Mapping[str, Any]
 """What a command found, by name, for the table of a sweep."""
 Body = Callable[[DictConfig], Figures | None]
+Summary = Callable[[Mapping[str, Figures]], str]
+"""What to print after a sweep, of the figures of each run by what it differs in."""
 
 
-def command(name: str) -> Callable[[Body], Callable[[], None]]:
+def figures_table(found: Mapping[str, Figures]) -> str:
+    """The usual `Summary`: a row per run."""
+    from pandas import DataFrame
+
+    return DataFrame.from_dict(found, orient="index").fillna("").to_string()
+
+
+def command(name: str, summary: Summary = figures_table) -> Callable[[Body], Callable[[], None]]:
     """Make a command of `body`, with the options of `cavin_pyro.config.commands.COMMANDS[name]`."""
 
     def decorate(body: Body) -> Callable[[], None]:
@@ -55,7 +64,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
             # Torch, not imported yet, reads it. Several threads wait for one another after each of many small products:
             # where another program uses a core, plans would take fifty times as long, and training would stand still.
             os.environ.setdefault("OMP_NUM_THREADS", "1")
-            guarded(lambda: _run(name, body))
+            guarded(lambda: _run(name, body, summary))
 
         main.__doc__ = body.__doc__
         return main
@@ -63,7 +72,7 @@ def command(name: str) -> Callable[[Body], Callable[[], None]]:
     return decorate
 
 
-def _run(name: str, body: Body) -> None:
+def _run(name: str, body: Body, summary: Summary) -> None:
     if sys.flags.optimize > 1:
         raise UserError("PYTHONOPTIMIZE=2, or python -OO, strips docstrings, which Pyro needs: unset it")
     line = read_command_line(sys.argv[1:])
@@ -81,7 +90,7 @@ def _run(name: str, body: Body) -> None:
     elif line.cfg:
         print(OmegaConf.to_yaml(config), end="")
     elif line.multirun:
-        _sweep(name, body, line)
+        _sweep(name, body, line, summary)
     else:
         guarded(lambda: body(config), name, line.overrides)
 
@@ -208,7 +217,7 @@ def read_command_line(arguments: Sequence[str]) -> argparse.Namespace:
     return line
 
 
-def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
+def _sweep(name: str, body: Body, line: argparse.Namespace, summary: Summary) -> None:
     """Let Hydra's application run a sweep, by its launchers: each run in a folder named by what differs."""
     import hydra
     from hydra.core.hydra_config import HydraConfig
@@ -229,6 +238,4 @@ def _sweep(name: str, body: Body, line: argparse.Namespace) -> None:
     sys.argv[1:] = ["--multirun", *presets, *words, *folder]
     hydra.main(version_base="1.3", config_path=None, config_name=name)(job)()
     if any(found.values()):  # none where other processes ran them
-        from pandas import DataFrame
-
-        print(f"\n{DataFrame.from_dict(found, orient='index').fillna('').to_string()}")
+        print(f"\n{summary(found)}")

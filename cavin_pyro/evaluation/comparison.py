@@ -159,6 +159,11 @@ def _test(reference: pd.DataFrame, own: pd.DataFrame, names: str) -> Row:
     return {**counts, "detectable": f"{shown:.1f} points" if shown else "-"}
 
 
+def as_text(table: pd.DataFrame) -> str:
+    """What `compare` found, for a terminal."""
+    return table.to_string(na_rep="", float_format="{:.2g}".format)
+
+
 def write_page(path: Path, table: pd.DataFrame) -> None:
     """Write what `compare` found as a page of HTML, atomically."""
     html = table.to_html(border=0, na_rep="", float_format="{:.2g}".format)

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluate import compared
 from cavin_pyro.evaluation.comparison import compare, write_page
 from cavin_pyro.evaluation.statistics import wilson
 
@@ -75,6 +76,15 @@ def test_damaged_results_are_not_compared_with(tmp_path: Path) -> None:
         (tmp_path / "results.json").write_text(json.dumps({"per_episode": rows}))
         with pytest.raises(UserError, match=r"holds damaged results \(.*\): evaluate it again"):
             compare(tmp_path)
+
+
+def test_a_sweep_is_compared_where_its_runs_met_the_same_scenes(tmp_path: Path) -> None:
+    files = {
+        name: {"folder": str(table(tmp_path / f"{name}.csv", seed=seeds, success=[1, 0]))}
+        for name, seeds in (("one", [1, 2]), ("other", [1, 2]), ("elsewhere", [3, 4]))
+    }
+    assert "p, Holm" in compared({name: files[name] for name in ("one", "other")})
+    assert "p, Holm" not in (said := compared(files)) and "elsewhere" in said
 
 
 def test_the_command_compares_and_refuses(shell: SimpleNamespace, tmp_path: Path) -> None:
