@@ -214,13 +214,13 @@ def draw_episode(path: Path, episode: Episode, world: World) -> None:
 
 
 def panels_of(count: int, picture: NDArray[np.uint8] | None) -> tuple[Figure, list[Axes]]:
-    """A figure with `count` panels in two columns, each in the proportions of a picture."""
+    """A figure with `count` panels in two columns, each in the proportions of a picture; without one, on equal axes."""
     rows, columns = -(-count // 2), min(2, count)
     height, width = (3, 4) if picture is None else (len(picture) - empty_rows(picture), picture.shape[1])
     size = (columns * PANEL_WIDTH, 0.35 + rows * (0.3 + PANEL_WIDTH * height / width))
     figure = Figure(figsize=size, dpi=DOTS_PER_INCH)
     figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02)
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    panels = list(figure.subplots(rows, columns, squeeze=False, sharex=picture is None, sharey=picture is None).flat)
     for panel in panels[count:]:
         panel.set_axis_off()
     return figure, panels
