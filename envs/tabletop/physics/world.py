@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,10 @@ class PhysicsWorld(Uncopied):
     """
 
     def __init__(self) -> None:
-        self.client = connect()  # for the files of this package alone
+        self.client = bullet = connect()  # for the files of this package alone
+        # Called a hundred times per push: the client looks each of its functions up whenever it is named.
+        self._advance, self._reset_pose = bullet.stepSimulation, bullet.resetBasePositionAndOrientation
+        self._reset_velocity = bullet.resetBaseVelocity
         self.on_step: Callable[[], None] | None = None  # called after every step, to film or to measure
         self.reset()
 
@@ -78,17 +82,7 @@ class PhysicsWorld(Uncopied):
         bullet.setGravity(0.0, 0.0, -GRAVITY)
         bullet.setTimeStep(TIME_STEP)
         bullet.setPhysicsEngineParameter(numSolverIterations=SOLVER_ITERATIONS, deterministicOverlappingPairs=1)
-        sides = [high - low for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
-        half = [side / 2 for side in (*sides, TABLE_THICKNESS)]
-        self.table = bullet.createMultiBody(
-            baseMass=0.0,
-            baseCollisionShapeIndex=bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half),
-            baseVisualShapeIndex=bullet.createVisualShape(
-                pybullet.GEOM_BOX, halfExtents=half, rgbaColor=(*TABLE_COLOR, 1.0)
-            ),
-            basePosition=(*TABLE_CENTER, -TABLE_THICKNESS / 2),
-        )
-        bullet.changeDynamics(self.table, -1, lateralFriction=TABLE_FRICTION)
+        self.table = _add_table(bullet)
 
     def add_object(self, asset: ObjectAsset, sampled: ObjectParameters, color: Sequence[float]) -> int:
         """Add a free body; every group of its mesh file becomes one convex part of its collision shape.
@@ -136,12 +130,12 @@ class PhysicsWorld(Uncopied):
 
     def place(self, body: int, position: Sequence[float], velocity: Sequence[float]) -> None:
         """Set an upright body's position (metres) and velocity (metres per second)."""
-        self.client.resetBasePositionAndOrientation(body, position, (0.0, 0.0, 0.0, 1.0))
-        self.client.resetBaseVelocity(body, velocity, (0.0, 0.0, 0.0))
+        self._reset_pose(body, position, (0.0, 0.0, 0.0, 1.0))
+        self._reset_velocity(body, velocity, (0.0, 0.0, 0.0))
 
     def step(self) -> None:
         """Advance by one `TIME_STEP`."""
-        self.client.stepSimulation()
+        self._advance()
         if self.on_step is not None:
             self.on_step()
 
@@ -190,15 +184,46 @@ class PhysicsWorld(Uncopied):
         """Depth, body numbers and colour as the camera sees them.
 
         Args:
-            table: whether to render it. It fills most of an image and takes four fifths of the rendering time.
+            table: whether to show it. It fills most of an image and would take four fifths of the time: it is rendered
+                once per camera, and what is nearer than it is put before it.
         """
-        if table:
-            return _render(self.client, camera)
         # The renderer omits fully transparent bodies.
         self.client.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, 0.0))
         rendering = _render(self.client, camera)
         self.client.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, 1.0))
-        return rendering
+        if not table:
+            return rendering
+        behind = _table_alone(camera)
+        nearer = rendering.depth < behind.depth
+        whole = Rendering(behind.depth.copy(), behind.bodies.copy(), behind.color.copy())
+        for name in ("depth", "bodies", "color"):
+            getattr(whole, name)[nearer] = getattr(rendering, name)[nearer]
+        return whole
+
+
+def _add_table(bullet: BulletClient) -> int:
+    sides = [high - low for low, high in zip(TABLE_LOW, TABLE_HIGH, strict=True)]
+    half = [side / 2 for side in (*sides, TABLE_THICKNESS)]
+    shape = {"shapeType": pybullet.GEOM_BOX, "halfExtents": half}
+    table = bullet.createMultiBody(
+        baseMass=0.0,
+        baseCollisionShapeIndex=bullet.createCollisionShape(**shape),
+        baseVisualShapeIndex=bullet.createVisualShape(rgbaColor=(*TABLE_COLOR, 1.0), **shape),
+        basePosition=(*TABLE_CENTER, -TABLE_THICKNESS / 2),
+    )
+    bullet.changeDynamics(table, -1, lateralFriction=TABLE_FRICTION)
+    return int(table)
+
+
+@lru_cache(maxsize=8)
+def _table_alone(camera: Camera) -> Rendering:
+    """In it the table has its usual number, that of the first body."""
+    bullet = connect()
+    try:
+        _add_table(bullet)
+        return _render(bullet, camera)
+    finally:
+        bullet.disconnect()
 
 
 def _render(bullet: BulletClient, camera: Camera) -> Rendering:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from cavin_pyro.envs.tabletop.physics import TIME_STEP, PhysicsWorld
@@ -38,11 +36,11 @@ class StickRobot:
         return ""
 
     def slide(self, end: Point) -> Stopped:
-        start = self._tip
-        phase = np.linspace(0.0, np.pi, PUSH_STEPS + 1)
-        travelled = (1.0 - np.cos(phase)) / 2.0
-        for now, then in pairwise(travelled):
-            self._put(start + now * (end - start), (then - now) / TIME_STEP * (end - start))
+        start, line = self._tip, end - self._tip
+        travelled = (1.0 - np.cos(np.linspace(0.0, np.pi, PUSH_STEPS + 1))) / 2.0
+        speeds = np.diff(travelled) / TIME_STEP
+        for tip, velocity in zip(start + travelled[:-1, None] * line, speeds[:, None] * line, strict=True):
+            self._put(tip, velocity)
             self._world.step()
         return self.move(end)
 

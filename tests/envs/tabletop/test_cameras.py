@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavin_pyro.envs.tabletop.physics.world import _render
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.envs.tabletop.sensors import Kinect2
 from cavin_pyro.envs.tabletop.sensors.camera import RAY_COLUMN, RAY_ROW, Camera
@@ -59,6 +60,14 @@ def test_the_renderer_draws_what_the_geometry_says_of_a_turned_and_shifted_camer
     top = points[points[:, 2] > 2 * truth[2] - 0.001]
     assert len(top) > 0.7 * len(points)  # the rest is a side of the cube
     np.testing.assert_allclose(top.mean(axis=0), (truth[0], truth[1], 2 * truth[2]), atol=0.002)
+
+
+def test_objects_before_a_table_rendered_once_are_the_image_of_all(scene: Scene, put: Callable) -> None:
+    scene.reset([put("mug", 0.5, 0.1), put("banana", 0.7, -0.1)], np.random.default_rng(0))
+    for camera in (Camera(), Camera(400, 300, (0.2, 0.3, 0.9), (0.5, 0.3, 0.1))):
+        whole, direct = scene.world.render(camera), _render(scene.world.client, camera)
+        for name in ("depth", "bodies", "color"):
+            np.testing.assert_array_equal(getattr(whole, name), getattr(direct, name))
 
 
 def test_the_kinect_measures_a_bare_table_as_its_noise_model_says(scene: Scene, put: Callable) -> None:
