@@ -231,6 +231,8 @@ def check_world(world: World) -> None:
         said = f"{earned}, {ended} and {info['success']}"
         raise ValueError(f"{name}: a step must give a finite reward, terminated and success as bool, not {said}")
     check_number(f"{name}: maximum_steps", world.maximum_steps, 1)
+    if len(world.names) != world.objects:
+        raise ValueError(f"{name}: names must be one for each of its {world.objects} objects, not {world.names}")
     plans = 5
     one = state.map(lambda field: field.expand(plans, *field.shape))
     goal = world.goal()

@@ -62,7 +62,14 @@ def compare(*evaluations: Evaluation, **methods: Sequence[Evaluation]) -> pd.Dat
     if not given or not all(runs for _, runs in given):
         raise UserError("there is nothing to compare: give at least one evaluation of each method")
     options: list[Row] = []
-    found = [_rows(run, name, training, options) for name, runs in given for training, run in enumerate(runs)]
+    found = [
+        _rows(run, name, training, options).assign(**({"method": name} if name in methods else {}))
+        for name, runs in given
+        for training, run in enumerate(runs)
+    ]
+    own = [name for rows in found[: len(evaluations)] for name in rows["method"].unique()]
+    if shared := [name for name in own if own.count(name) > 1]:
+        raise UserError(f"two evaluations are of a method {shared[0]}: give its trainings as --method NAME RUN RUN")
     episodes = pd.concat(found, ignore_index=True)
     if (twice := episodes.duplicated(["method", "training", "seed"])).any():
         name, seed = episodes.loc[twice.idxmax(), ["method", "seed"]]
@@ -88,18 +95,19 @@ def _rows(run: Evaluation, name: str, training: int, options: list[Row]) -> pd.D
             found = READERS[Path(run).suffix](Path(run))
     elif isinstance(run, str | Path):
         rows, theirs = _finished(Path(run))
-        for mine in options[:1]:
-            _check_same_scenes(mine, theirs, run)
         options.append(theirs)
+        for option in sorted({*options[0], *theirs}):
+            if option.partition(".")[0] in SAME_SCENES and (one := theirs.get(option)) != options[0].get(option):
+                raise UserError(f"{run} has {option}={one}, not {options[0].get(option)}: its scenes differ")
         found = pd.DataFrame(rows)
+    elif isinstance(run, pd.DataFrame):
+        found = run
     else:
         with user_input(where=f"{where} is no evaluation"):
             found = pd.DataFrame(run["per_episode"] if isinstance(run, Mapping) else list(run))
     if "success" not in found and "outcome" in found and found["outcome"].isin(OUTCOMES).all():
         found["success"] = found["outcome"] == "success"
-    found = found.assign(
-        **{key: value for key, value in {"method": name, "training": training}.items() if key not in found}
-    )
+    found = found.assign(method=found.get("method", name), training=found.get("training", training))
     for column, kinds in {"seed": "iu", "success": "biuf", "method": "OU", "training": "iuOU", "steps": "iuf"}.items():
         if column == "steps" and column not in found:
             continue
@@ -123,12 +131,6 @@ def _finished(folder: Path) -> tuple[list[Row], Row]:
     if wrong:
         raise UserError(f"{folder} holds damaged results ({wrong}): evaluate it again")
     return rows, theirs
-
-
-def _check_same_scenes(mine: Row, theirs: Row, folder: object) -> None:
-    for name in sorted(set(mine) | set(theirs)):
-        if name.partition(".")[0] in SAME_SCENES and mine.get(name) != theirs.get(name):
-            raise UserError(f"{folder} has {name}={theirs.get(name)}, not {mine.get(name)}: its scenes differ")
 
 
 def _rate(own: pd.DataFrame) -> Row:

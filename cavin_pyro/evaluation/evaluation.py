@@ -53,6 +53,8 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
     Raises:
         UserError: an option out of its range, or a folder that holds another evaluation.
     """
+    if config is not None and (options or not isinstance(config, DictConfig) or "episodes" not in config):
+        raise UserError("evaluate takes options by their names, such as task='crossing', or only a configuration of it")
     config = compose("evaluate", **options) if config is None else config
     config.device = choose_device(config.device).type  # once, for all workers and for who resumes
     with output_folder(config.output) as folder:

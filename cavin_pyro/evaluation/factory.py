@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.commands import CHECKPOINTS
 from cavin_pyro.config.composition import compose
-from cavin_pyro.config.device import choose_device, keep_freed_memory, set_matmul_precision
+from cavin_pyro.config.device import choose_device, set_matmul_precision
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import About, check_value
 from cavin_pyro.config.parts import check_sizes, class_of, construct
@@ -80,9 +80,11 @@ def make_env(
     Raises:
         UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
+    if config is not None and (options or not isinstance(config, DictConfig)):
+        raise UserError("make_env takes options by their names, such as task='crossing', or only a configuration")
+    if geometry is not None and not callable(geometry):
+        raise UserError(f"geometry must be that of a checkpoint, load(NAME).geometry, not {geometry!r}")
     config = compose("plan", **options) if config is None else config
-    if not isinstance(config, DictConfig):
-        raise UserError(f"make_env takes options by their names, such as task='crossing', not {config!r}")
     if (world := world_of(config)) is not None:
         pictures = render and type(world).render is not World.render
         world.render_mode = "rgb_array" if pictures else None
@@ -171,7 +173,6 @@ def make_runner(config: DictConfig, *, render: bool = False) -> EpisodeRunner:
     if unread and config.layout != GENERATED:
         raise UserError(f"generated.{unread[0]} is an option of layout=generated: give that, or leave it out")
     set_matmul_precision(config.matmul_precision)
-    keep_freed_memory()
     env = make_env(config, render=render)
     model_free, model = config.planner.get("model_free"), None
     try:

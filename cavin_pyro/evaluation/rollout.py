@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
@@ -171,6 +170,9 @@ def rollout(
             optimizer, a world or a planner of the user's own raises an error.
         RuntimeError: the robot stands in the camera's view.
     """
+    if not isinstance(env, World) or not hasattr(planner, "plan"):
+        given = f"{type(env).__name__} and {type(planner).__name__}"
+        raise UserError(f"rollout takes a world, as of make_env, and then a planner, as of make_planner, not {given}")
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
@@ -178,8 +180,13 @@ def rollout(
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
-    env.on_frame = partial(_call_on_frame, callbacks) if callbacks else None
-    with _refusals(seed, env):
+
+    def on_frame() -> None:
+        for callback in callbacks:
+            callback.on_frame()
+
+    env.on_frame = on_frame if callbacks else None
+    with refusals(seed, env):
         observation = env.reset(seed=seed)[0] if start is None else start
         goal = env.goal(device)
     for callback in callbacks:
@@ -187,15 +194,19 @@ def rollout(
     ended = False
     while not ended:
         began = time.perf_counter()
-        with _refusals(seed, env):
+        with refusals(seed, env):
             state = env.state(observation).map(lambda field: field.unsqueeze(0).to(device))
             shown = env.observed(observation)
         shown = shown and apply(shown, lambda field: field.to(device))
-        with _refusals(seed, planner):
+        with refusals(seed, env), refusals(seed, planner):  # the user's may be a task, which the planner asks
             left = env.maximum_steps - len(episode.transitions)
             plan = planner.plan(state, reward=goal, generators=[generator], observed=shown, steps_left=left)
-        if not isinstance(plan, Plan):
-            raise UserError(f"{type(planner).__name__}.plan must return a Plan, not {type(plan).__name__}")
+            if not isinstance(plan, Plan):
+                raise UserError(f"{type(planner).__name__}.plan must return a Plan, not {type(plan).__name__}")
+            shape = list(plan.actions.shape)
+            if len(shape) != 3 or shape[::2] != [1, env.space.actions] or not plan.actions.isfinite().all():
+                wanted = f"actions [1, T, {env.space.actions}], all finite"
+                raise UserError(f"{type(planner).__name__}.plan must return {wanted}, not {shape}")
         plan = apply(plan, lambda field: field.cpu())
         centers, mask = env.positions(observation)
         record = PlanRecord(
@@ -213,7 +224,7 @@ def rollout(
         if not 1 <= (len(actions) if pushes_per_plan is None else pushes_per_plan) <= len(actions):
             raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
-            with _refusals(seed, env):
+            with refusals(seed, env):
                 observation, earned, terminated, truncated, info = env.step(action)
                 centers, _ = env.positions(observation)
             last = number == len(actions) - 1
@@ -245,21 +256,36 @@ def rollout(
 
 
 @contextmanager
-def _refusals(seed: int, part: World | Planner) -> Iterator[None]:
-    """What is wrong with a scene or a search, and whatever a part of the user's own raises, as a `UserError`."""
-    own = [part, getattr(part, "optimizer", part), *getattr(part, "additions", ())]
-    ours = all(type(one).__module__.startswith("cavin_pyro.") for one in own)
+def refusals(seed: int, part: World | Planner) -> Iterator[None]:
+    """What is wrong with a scene or a search, and whatever comes of a part of the user's own, as a `UserError`."""
     try:
-        with nullcontext() if ours else user_input("env", "planner"):
-            yield
-    except (OptimizerError, NoFiniteCandidateError, UnsuitedError) as error:
-        raise UserError(str(error)) from error
+        yield
     except NoRoomError as error:
         raise UserError(f"seed={seed}: {error}") from error
+    except (OptimizerError, NoFiniteCandidateError, UnsuitedError) as error:
+        raise UserError(str(error)) from error
+    except (Exception, SystemExit) as error:
+        known = ("cavin_pyro", "torch", "pyro", "builtins")
+        ours = all(type(one).__module__.partition(".")[0] in known for one in _parts(part))
+        if ours or isinstance(error, UserError):
+            raise
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        refused = UserError(f"{kind}{one_line(error)}{kind and '; --traceback shows where'}")
+        refused.sections = ("env", "planner", "task")
+        raise refused from error
+
+
+def _parts(part: Any) -> Iterator[Any]:
+    """A world or a planner, and the parts of it that may be of the user's own."""
+    yield part
+    for name in ("optimizer", "motion_optimizer", "task", "scene", "sensor", "segmenter", "robot"):
+        yield from _parts(getattr(part, name)) if hasattr(part, name) else ()
+    yield from getattr(part, "additions", ())
+    yield from part.model.modules() if isinstance(getattr(part, "model", None), torch.nn.Module) else ()
 
 
 def _picture(env: World, seed: int) -> NDArray[np.uint8] | None:
-    with _refusals(seed, env):
+    with refusals(seed, env):
         picture = env.render()
     if picture is not None and (np.ndim(picture), getattr(picture, "dtype", None)) != (3, np.uint8):
         kind = f"{type(env).__name__}.render"
@@ -267,11 +293,6 @@ def _picture(env: World, seed: int) -> NDArray[np.uint8] | None:
             f"{kind} must return a picture [height, width, 3] of uint8, or None, not {type(picture).__name__}"
         )
     return picture
-
-
-def _call_on_frame(callbacks: Sequence[EpisodeCallback]) -> None:
-    for callback in callbacks:
-        callback.on_frame()
 
 
 def _end(flags: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,10 @@ def violation(row: Any) -> str | None:
         return f"its keys must be {', '.join(FIELDS)}"
     wrong = [name for name, kinds in FIELDS.items() if not isinstance(row[name], kinds)]
     wrong += [name for name in ("outcome", "strict_outcome") if row[name] not in OUTCOMES]
+    for name in () if wrong else FIELDS.keys() - {"outcome", "strict_outcome"}:
+        for one in row[name] if isinstance(row[name], list) else [row[name]]:
+            number = type(one) in (int, float) and math.isfinite(one) and (one >= 0 or name.endswith("return"))
+            wrong += [] if number or one is None else [name]
     return f"{wrong[0]} cannot be {json.dumps(row[wrong[0]])[:40]}" if wrong else None
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import pandas as pd
 from omegaconf import DictConfig
 
+from cavin_pyro.config.application import Interruption
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.device import set_matmul_precision
 from cavin_pyro.config.errors import UserError
@@ -160,7 +161,7 @@ def run_stage(stage: Stage) -> Path:
             import_module(f"cavin_pyro.{stage.command}").main()
     except SystemExit as end:
         if end.code in (129, 130, 143):  # SIGHUP, SIGINT, SIGTERM
-            raise KeyboardInterrupt from end
+            raise Interruption(end.code - 128) from end
         last = log.read_text(encoding="utf-8").strip().splitlines()[-1].removeprefix("error: ")
         line = shlex.join(["python", "-m", f"cavin_pyro.{stage.command}", *sys.argv[1:]])
         raise UserError(f"{line} failed: {last} ({log})") from end

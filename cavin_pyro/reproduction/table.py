@@ -13,6 +13,7 @@ from omegaconf import DictConfig
 from statsmodels.stats.multitest import multipletests
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.evaluation.rollout import OUTCOMES
 from cavin_pyro.evaluation.statistics import hierarchical_interval, mcnemar, wilson
 from cavin_pyro.reproduction.cells import Cell
 from cavin_pyro.reproduction.methods import METHODS
@@ -61,7 +62,12 @@ def write_table(path: Path, table: pd.DataFrame) -> None:
 def read_table(path: Path) -> pd.DataFrame:
     """The table of a run, in its order; a UserError: the file cannot be read, or holds something else."""
     try:
-        return pd.read_parquet(path, columns=list(COLUMNS)).astype(COLUMNS)
+        found = pd.read_parquet(path, columns=list(COLUMNS)).astype(COLUMNS)
+        if not found[[f"{criterion}_outcome" for criterion in CRITERIA]].isin(OUTCOMES).all(axis=None):
+            raise ValueError(f"an outcome is none of {', '.join(OUTCOMES)}")
+        if found.duplicated([*CELL, "training_seed", "seed"]).any():
+            raise ValueError("an episode is there twice")
+        return found
     except (OSError, ValueError, KeyError, TypeError, pyarrow.ArrowException) as error:
         why = str(error).splitlines()[0]
         raise UserError(f"{path} is no table of episodes ({why}): give an episodes.parquet of reproduce") from error

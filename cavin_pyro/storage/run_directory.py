@@ -28,6 +28,8 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
     `ignore`: options that may differ, as `section.name`. A `UserError` names the first other one that does.
     """
     path = folder / CONFIG_NAME
+    if not path.exists() and any((folder / name).exists() for name in ("episodes.jsonl", "resume.safetensors")):
+        raise UserError(f"{folder} holds results, and no {CONFIG_NAME} says of what: choose another output=DIR")
     if not path.exists() or holds_no_result(folder):
         return  # there is nothing to protect
     with user_input(where=f"{path} is damaged, choose another output=DIR"):

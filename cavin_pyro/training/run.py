@@ -177,6 +177,9 @@ def fit(
 
 def _check_parts(model: Model, guide: Guide, windows: WindowTable) -> None:
     """Raise ValueError for a guide of another model, or windows of other sizes than the model's."""
+    if not isinstance(model, Model) or not isinstance(guide, Guide) or not isinstance(windows, WindowTable):
+        given = ", ".join(type(one).__name__ for one in (model, guide, windows))
+        raise ValueError(f"fit takes a Model, its Guide and a WindowTable, in this order, not {given}")
     if guide.model is not model:
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
     one = windows.batch(windows.training[:1])

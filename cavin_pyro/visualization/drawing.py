@@ -209,6 +209,9 @@ def draw_episode(path: Path, episode: Episode, world: World) -> None:
     draw_ground(end, episode.photograph)
     draw_paths(end, world, first, centers, REACHED)
     draw_target(end, world, centers[-1] if total else first.centers)
+    if world.space.positions == 1 and episode.photograph is None:  # a line
+        for panel in panels:
+            panel.set(aspect="auto", yticks=[])
     end.set_title(f"{world.name}, seed {episode.seed}: {ending(world, episode)}", fontsize=FONT, fontweight="bold")
     finish(path, figure, legend(world, chosen))
 

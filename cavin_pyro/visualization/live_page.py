@@ -8,7 +8,7 @@ import logging
 import math
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
@@ -43,10 +43,8 @@ def serve(config: DictConfig) -> None:
         loop = LiveLoop(config)
         page = Page(server, loop)
         print(f"http://{HOST}:{server.get_port()}/{token}/ (Ctrl-C ends)", flush=True)
-        try:
+        with closing(loop.world), suppress(KeyboardInterrupt):
             loop.run(page)
-        finally:
-            loop.world.close()
 
 
 @contextmanager
@@ -170,8 +168,8 @@ class Page(EpisodeCallback):
         self.scene.remove_by_name("/imagined")
         self.scene.remove_by_name("/candidates")
         centers = plan.candidate_centers[0].numpy()  # [N, K, M, P]; of some planners the target alone
-        finite = np.flatnonzero(np.isfinite(centers[:, -1, 0]).all(-1))
-        chosen = np.random.default_rng(0).permutation(finite)[: drawing.CANDIDATES]
+        ends = centers[:, -1, 0] if centers.size else np.zeros((0, 2))  # some planners predict nothing
+        chosen = np.random.default_rng(0).permutation(np.flatnonzero(np.isfinite(ends).all(-1)))[: drawing.CANDIDATES]
 
         def imagine(click: Any) -> None:
             number = int(chosen[click.instance_index])
@@ -181,7 +179,7 @@ class Page(EpisodeCallback):
         if len(chosen):
             ball, turns = trimesh.creation.icosphere(1, 0.006), np.tile([1.0, 0.0, 0.0, 0.0], (len(chosen), 1))
             style = {"batched_colors": rgb(drawing.CANDIDATE["color"]), "opacity": 0.35, "cast_shadow": False}
-            shape = (np.array(ball.vertices), np.array(ball.faces), turns, self.points(centers[chosen, -1, 0]))
+            shape = (np.array(ball.vertices), np.array(ball.faces), turns, self.points(ends[chosen]))
             self.scene.add_batched_meshes_simple("/candidates", *shape, **style).on_click(imagine)
         self.say(f"planned{record.prospect}")
 

@@ -13,7 +13,7 @@ from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.world import World
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner
-from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition
+from cavin_pyro.evaluation.rollout import Episode, EpisodeCallback, PlanRecord, Transition, refusals
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.visualization.drawing import draw_episode
 from cavin_pyro.visualization.video import Film
@@ -71,9 +71,10 @@ def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: str
     episode = runner.rollout(seed, photograph=True, callbacks=[EpisodeProgress(env), *([film] if film else [])])
     if isinstance(env, PushingEnv):
         write_steps(folder / "steps.csv", episode)
-    draw_episode(folder / "plan.png", episode, env)
-    if film:
-        film.write(folder / f"episode.{video}", episode)
+    with refusals(seed, env):
+        draw_episode(folder / "plan.png", episode, env)
+        if film:
+            film.write(folder / f"episode.{video}", episode)
     return episode_row(episode)
 
 

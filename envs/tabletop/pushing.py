@@ -88,8 +88,7 @@ class PushingEnv(Uncopied, World):
         object_set: a key of `cavin_pyro.envs.tabletop.objects.object_sets.OBJECT_SETS`, or a set.
         camera, segmentation: see `cavin_pyro.envs.tabletop.scene.Scene`.
         assets: folder of meshes, for robots and sets that need one.
-        maximum_steps: pushes per episode. show_tiles: whether pictures show the layout on the table, and the
-            objects' places.
+        maximum_steps: pushes per episode.
 
     Raises:
         ValueError: an argument is out of its range, a function of the user's task returns another type or shape than
@@ -120,14 +119,12 @@ class PushingEnv(Uncopied, World):
         camera: str | Camera | DepthSensor = "ideal",
         segmentation: str | SegmenterFactory = "mask",
         render_mode: str | None = None,
-        show_tiles: bool = True,
         robot: str | RobotFactory = "stick",
     ) -> None:
         check_kinds(locals(), KINDS)
         check_number("objects", objects, 1, MAXIMUM_OBJECTS, whole=True)
         check_number("maximum_steps", maximum_steps, 1, whole=True)
         check_choice("render_mode", render_mode, (None, "rgb_array"))
-        check_choice("show_tiles", show_tiles, (True, False))
         if isinstance(task, Task) and (layout != 0 or tiles):
             raise ValueError("a task object has its own layout: give its class, or neither layout nor tiles")
         self._generate: Callable[[np.random.Generator], Task] | None = None
@@ -146,7 +143,6 @@ class PushingEnv(Uncopied, World):
         self._begin(self.tasks[0])
         self.goal()
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
-        self.show_tiles = show_tiles
         available = load_object_set(object_set, assets)
         named = ranges or {"names": tuple(dict.fromkeys(map(plain_name, available.names)))}
         self.ranges = ObjectRanges(**named) if isinstance(named, Mapping) else named
@@ -193,8 +189,7 @@ class PushingEnv(Uncopied, World):
         areas = [target, *[obstacle] * (self.objects - 1)]
         can_start = partial(self._can_start, self.task, named_stream(scene_generator, GOAL))
         self._observation = self.scene.sample(areas, self.ranges, scene_generator, acceptable=can_start)
-        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
-        self.scene.places = self.task.object_places() if self.show_tiles else ()
+        self.scene.markings, self.scene.places = self.task.tile_groups(), self.task.object_places()
         self._steps = 0
         return _as_dict(self._observation), {"steps": 0, "task": self.task}
 
@@ -297,8 +292,7 @@ class PushingEnv(Uncopied, World):
         assert self._observation is not None
         target = self._observation.centers[0, :2]
         self._begin(self.task.moved(goals, (float(target[0]), float(target[1]))))
-        self.scene.markings = self.task.tile_groups() if self.show_tiles else ()
-        self.scene.places = self.task.object_places() if self.show_tiles else ()
+        self.scene.markings, self.scene.places = self.task.tile_groups(), self.task.object_places()
 
     def close(self) -> None:
         """Free the simulator."""

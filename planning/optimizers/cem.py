@@ -79,7 +79,7 @@ class ICEM(CEM):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_number("kept_elite_fraction", self.kept_elite_fraction, high=1)
-        check_number("exponent", self.exponent)
+        check_number("exponent", self.exponent, high=10)
 
     def colour(self, noise: Tensor) -> Tensor:
         """Noise `[B, n, K, D]` that is coloured over the segments."""

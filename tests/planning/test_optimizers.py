@@ -105,7 +105,7 @@ def test_an_optimizer_works_at_both_levels(toy: SimpleNamespace, name: str) -> N
     [
         ("cem", {"iterations": 1.5}, "iterations must be a whole number of at least 1, not 1.5"),
         ("icem", {"kept_elite_fraction": 2}, "kept_elite_fraction must be a number of at least 0 and at most 1, not 2"),
-        ("icem", {"exponent": -1}, "exponent must be a number of at least 0, not -1"),
+        ("icem", {"exponent": -1}, "exponent must be a number of at least 0 and at most 10, not -1"),
         ("evolution", {"initial_fraction": 0}, "initial_fraction must be a number above 0 and at most 1, not 0"),
         ("smc", {"moves": -1}, "moves must be a whole number of at least 0, not -1"),
         ("smc", {"temperature": 0.0}, "temperature must be a number above 0, not 0.0"),

@@ -89,11 +89,12 @@ def test_a_sweep_is_compared_where_its_runs_met_the_same_scenes(tmp_path: Path) 
 
 def test_the_command_compares_and_refuses(shell: SimpleNamespace, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        table(tmp_path / f"{name}.csv", seed=[1, 2], success=[1, 0])
+        table(tmp_path / f"{name}.csv", seed=[1, 2], success=[1, 0], method=["theirs"] * 2)
     answer = shell.run_command("compare", "a.csv", "--method", "mine", "b.csv", folder=tmp_path)
-    assert answer.status == 0 and "mine" in answer.output and (tmp_path / "compare.html").exists()
+    assert answer.status == 0 and "mine" in answer.output.splitlines()[2] and (tmp_path / "compare.html").exists()
     for words in (
         ["a.csv", "nowhere"],
+        ["a.csv", "b.csv"],
         ["a.csv", "--output", "a.csv"],
         ["--method", "a", "a.csv", "--method", "a", "b.csv"],
     ):

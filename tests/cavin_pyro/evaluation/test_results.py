@@ -49,9 +49,9 @@ def test_whole_rows_are_read(tmp_path: Path) -> None:
     ("row", "said"),
     [
         ([1], "its keys must be "),
-        ({"seed": 11}, "its keys must be "),
         ({**ROW, "seed": 11, "outcome": "sucess"}, 'outcome cannot be "sucess")'),
-        ({**ROW, "seed": 11, "planning_ms": 5}, "planning_ms cannot be 5)"),
+        ({**ROW, "seed": 11, "planning_ms": ["fast"]}, 'planning_ms cannot be ["fast"])'),
+        ({**ROW, "seed": 11, "steps": -5}, "steps cannot be -5)"),
         ({**ROW, "steps": 5}, "an earlier line has another episode with seed 10)"),
     ],
 )

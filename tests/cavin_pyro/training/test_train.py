@@ -119,10 +119,7 @@ def test_an_automatic_guide_learns_its_windows_resumes_and_says_what_it_is(
     if guide == "auto_normal":
         assert whole.rows[-1]["validation_loss"] < whole.rows[0]["validation_loss"]
     half = run(folder, f"{guide}-half", *options)
-    again = folder / f"{guide}-again"
-    again.mkdir()
-    for name in ("resume.safetensors", "metrics.csv", "checkpoint.safetensors"):
-        shutil.copy(half.folder / name, again)
+    again = shutil.copytree(half.folder, folder / f"{guide}-again")
     resumed = run(folder, again.name, *options, "trainer.steps=8")
     for name, value in whole.guide.state_dict().items():
         assert torch.equal(value, resumed.guide.state_dict()[name]), name

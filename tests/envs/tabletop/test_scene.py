@@ -93,9 +93,11 @@ def test_an_observation_has_a_cloud_per_object_and_zeros_for_padding(scene: Scen
 @pytest.mark.parametrize("task", ["crossing", "rearrange"])
 def test_the_camera_sees_and_measures_the_same_with_tiles_and_without(task: str) -> None:
     observed, pictures = [], []
-    for show_tiles in (True, False):
-        env = PushingEnv(task=task, objects=3, render_mode="rgb_array", show_tiles=show_tiles)
+    for tiles in (True, False):
+        env = PushingEnv(task=task, objects=3, render_mode="rgb_array")
         observation, _ = env.reset(seed=2)
+        if not tiles:
+            env.scene.markings = env.scene.places = ()
         pictures.append(env.render())
         rendering = env.scene.world.render(env.scene.sensor.nominal)
         after, *_ = env.step(np.array([0.1, 0.2, 0.9, -0.4], dtype=np.float32))
