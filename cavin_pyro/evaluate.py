@@ -27,11 +27,8 @@ def main(config: DictConfig) -> Figures:
 
     results, folder = evaluate(config), Path(config.output)
     print(f"{(folder / 'results.txt').read_text(encoding='utf-8')}written: {folder / 'results.json'}")
-    return {
-        "success": f"{100 * results['success']['rate']:.1f} %",
-        "episodes": results["episodes"],
-        "folder": str(folder),
-    }
+    success = f"{100 * results['success']['rate']:.1f} %"
+    return {"success": success, "episodes": results["episodes"], "folder": str(folder)}
 
 
 if __name__ == "__main__":

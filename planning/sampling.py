@@ -35,7 +35,9 @@ def sample_codes(
         if isinstance(source, Tensor):
             codes.append(reparameterize(here, source))
         else:
-            codes.append(sample(here, source, _device(conditions[0])))
+            first = conditions[0]
+            device = (first.centers if isinstance(first, State) else first).device
+            codes.append(sample(here, source, device))
     return torch.stack(codes)
 
 
@@ -97,10 +99,6 @@ def sample(prior: Distribution, generator: torch.Generator, device: torch.device
         return reparameterize(prior, torch.randn(shape, generator=generator, device=generator.device).to(device))
     with _global_randomness_from(generator, device):
         return prior.sample()
-
-
-def _device(condition: State | Tensor) -> torch.device:
-    return (condition.centers if isinstance(condition, State) else condition).device
 
 
 @contextmanager

@@ -292,7 +292,7 @@ class ReproduceConfig(DeviceOptions):
     """Options of `python -m cavin_pyro.reproduce`."""
 
     defaults: list[Any] = preset_defaults("")
-    scale: str = option("smoke", "how large: minutes (smoke) to days (paper)", choices=f"{REPRODUCE}.cells.SIZES")
+    scale: str = option("smoke", "how large: minutes (smoke) to days (paper)", choices=f"{REPRODUCE}.sizes.SIZES")
     methods: list[str] = option(
         ["cavin", "sectar", "cvae_mpc", "mpc"],
         "methods; contact is CAVIN with networks that see contact",
@@ -300,11 +300,11 @@ class ReproduceConfig(DeviceOptions):
     )
     priors: str | None = option(None, "priors of codes; by default the scale's", choices=("standard", "conditional"))
     planners: list[str] = option(["paper", "ours"], "kinds of planners", choices=f"{REPRODUCE}.cells.PLANNERS")
-    tasks: list[str] = option(PAPER_TASKS, "tasks", choices=f"{REPRODUCE}.cells.TASKS")
+    tasks: list[str] = option(PAPER_TASKS, "tasks", choices=f"{REPRODUCE}.sizes.TASKS")
     objects: list[int] = option(
-        [1, 2, 3, 4, 5], "numbers of objects with sparse rewards", choices=f"{REPRODUCE}.cells.OBJECT_COUNTS"
+        [1, 2, 3, 4, 5], "numbers of objects with sparse rewards", choices=f"{REPRODUCE}.sizes.OBJECT_COUNTS"
     )
-    rewards: list[str] = option(["dense", "sparse"], "rewards of the tasks", choices=f"{REPRODUCE}.cells.REWARDS")
+    rewards: list[str] = option(["dense", "sparse"], "rewards of the tasks", choices=f"{REPRODUCE}.sizes.REWARDS")
     episodes: int | None = option(None, "episodes per cell of the top row; by default the scale's", minimum=1)
     bottom_episodes: int | None = option(None, "episodes per cell of the bottom row; by default the scale's", minimum=1)
     first_scene: int | None = option(None, "seed of the first scene; by default the scale's", minimum=0)

@@ -8,10 +8,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from cavin_pyro.criticism.codes import SYMBOLS, sample_guide
 from cavin_pyro.criticism.estimates import Interval, clustered_interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, grade
-from cavin_pyro.criticism.windows import SYMBOLS, sample_guide, seeded
+from cavin_pyro.criticism.windows import seeded
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, window_terms
 

@@ -15,9 +15,10 @@ from pyro.infer import Predictive
 from torch import Tensor
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.codes import log_weights
 from cavin_pyro.criticism.estimates import arviz
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.windows import all_pushes, log_weights, seeded
+from cavin_pyro.criticism.windows import all_pushes, seeded
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.storage.files import atomic_write
 

@@ -12,20 +12,11 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from cavin_pyro.criticism.codes import SYMBOLS, Codes, guide_density, log_weights, sample_guide, unsuitable_codes
 from cavin_pyro.criticism.estimates import arviz, covered, draw_ranks, mean_interval, rank
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.section import Section, conclude, not_applicable, within, worst
-from cavin_pyro.criticism.windows import (
-    SYMBOLS,
-    Codes,
-    all_pushes,
-    guide_density,
-    log_weights,
-    sample_guide,
-    sampled_values,
-    seeded,
-    unsuitable_codes,
-)
+from cavin_pyro.criticism.windows import all_pushes, sampled_values, seeded
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.space import unit
 from cavin_pyro.models.state import State, Window

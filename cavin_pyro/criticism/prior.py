@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from pyro import poutine
 from torch import Tensor, nn
 
+from cavin_pyro.criticism.codes import Codes, sample_guide, unsuitable_codes
 from cavin_pyro.criticism.estimates import Interval, mean_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import pair_distances, path_distances, start_distances
 from cavin_pyro.criticism.section import INSPECT, Section, conclude, grade, not_applicable
-from cavin_pyro.criticism.windows import Codes, GeneratedWindow, generated, sample_guide, seeded, unsuitable_codes
+from cavin_pyro.criticism.windows import GeneratedWindow, generated, seeded
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.space import Space

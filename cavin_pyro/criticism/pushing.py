@@ -40,7 +40,8 @@ class Nearness:
         pair = torch.quantile(several, CLOSE_PAIR_SHARE).item() if len(several) else 0.0
         if space != SPACE:
             return cls(pair, 0.0)
-        moved = (_moves_of_pushes(real) > space.center_scale).any(-1).to(real.steps.dtype).mean()
+        moves = (real.steps - _before(real)).norm(dim=-1) * real.first.mask.unsqueeze(1)
+        moved = (moves > space.center_scale).any(-1).to(real.steps.dtype).mean()
         return cls(pair, torch.quantile(path_distances(real).amin(-1), moved).item())
 
 
@@ -112,11 +113,6 @@ def _statistics_of_ends(part: str, near: float, space: Space) -> list[Statistic]
 def _before(outcome: GeneratedWindow) -> Tensor:
     """Centres before each push: `[B, T, M, 3]`."""
     return torch.cat((outcome.first.centers.unsqueeze(1), outcome.steps[:, :-1]), 1)
-
-
-def _moves_of_pushes(outcome: GeneratedWindow) -> Tensor:
-    """How far each push moves each object: `[B, T, M]` metres, 0 for padding."""
-    return (outcome.steps - _before(outcome)).norm(dim=-1) * outcome.first.mask.unsqueeze(1)
 
 
 def pair_distances(centers: Tensor, mask: Tensor) -> Tensor:

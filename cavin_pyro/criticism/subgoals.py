@@ -18,11 +18,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from cavin_pyro.config.errors import UserError
+from cavin_pyro.criticism.codes import NO_CODES, SYMBOLS
 from cavin_pyro.criticism.estimates import UNKNOWN, ratio_interval
 from cavin_pyro.criticism.loading import CheckContext
 from cavin_pyro.criticism.pushing import length_text
 from cavin_pyro.criticism.section import NONE, Section, Verdict, conclude, grade, not_applicable
-from cavin_pyro.criticism.windows import NO_CODES, SYMBOLS
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, open_scene
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.observation import Observation

@@ -65,7 +65,10 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
     steps = max((len(one["actions"]) for one in episodes), default=0)
     if not 1 <= steps <= dataset.LARGEST["S"]:
         raise UserError(f"minari:{identity} has episodes of up to {steps} steps: from 1 to {dataset.LARGEST['S']} fit")
-    digest = _digest(Path(source.storage.data_path))
+    home = Path(source.storage.data_path)
+    files = sorted(path for path in home.rglob("*") if path.is_file())
+    told = "".join(f"{path.relative_to(home)} {file_digest(path)}\n" for path in files)
+    digest = hashlib.sha256(told.encode()).hexdigest()
     metadata = {
         "configuration": {**described(world, section), "steps": steps, "minari": identity, "sha256": digest},
         "made_by": f"cavin_pyro {__version__}",
@@ -97,10 +100,3 @@ def _at(observations: Any, step: int) -> Any:
     if isinstance(observations, tuple):
         return tuple(_at(part, step) for part in observations)
     return observations[step]
-
-
-def _digest(folder: Path) -> str:
-    """The SHA-256 of all files of a dataset of Minari."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    told = "".join(f"{path.relative_to(folder)} {file_digest(path)}\n" for path in files)
-    return hashlib.sha256(told.encode()).hexdigest()

@@ -12,8 +12,6 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.rollout import OUTCOMES
 
 Row = dict[str, Any]
-
-
 FIELDS: dict[str, tuple[type, ...]] = {
     **dict.fromkeys(("seed", "steps", "strict_steps", "unsafe", "ineffective", "plans", "plans_reaching_goal"), (int,)),
     **dict.fromkeys(("outcome", "strict_outcome"), (str,)),
@@ -27,13 +25,18 @@ def violation(row: Any) -> str | None:
     """What makes a value no row of an episode; None if it is one."""
     if not isinstance(row, Mapping) or set(row) != set(FIELDS):
         return f"its keys must be {', '.join(FIELDS)}"
-    wrong = [name for name, kinds in FIELDS.items() if not isinstance(row[name], kinds)]
-    wrong += [name for name in ("outcome", "strict_outcome") if row[name] not in OUTCOMES]
-    for name in () if wrong else FIELDS.keys() - {"outcome", "strict_outcome"}:
-        for one in row[name] if isinstance(row[name], list) else [row[name]]:
-            number = type(one) in (int, float) and math.isfinite(one) and (one >= 0 or name.endswith("return"))
-            wrong += [] if number or one is None else [name]
-    return f"{wrong[0]} cannot be {json.dumps(row[wrong[0]])[:40]}" if wrong else None
+    wrong = next((name for name, kinds in FIELDS.items() if not _fits(name, row[name], kinds)), None)
+    return None if wrong is None else f"{wrong} cannot be {json.dumps(row[wrong])[:40]}"
+
+
+def _fits(name: str, value: Any, kinds: tuple[type, ...]) -> bool:
+    """Whether a field is of its kinds: an outcome, or finite numbers, of which only returns may be negative."""
+    if kinds == (str,):
+        return value in OUTCOMES
+    entries: list[Any] = value if isinstance(value, list) else [value]
+    least = -math.inf if name.endswith("return") else 0.0
+    numbers = all(one is None or (type(one) in (int, float) and least <= one < math.inf) for one in entries)
+    return numbers and isinstance(value, kinds)
 
 
 def finished_episodes(path: Path) -> dict[int, Row]:

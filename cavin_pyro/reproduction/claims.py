@@ -8,9 +8,9 @@ from typing import Any
 import pandas as pd
 from statsmodels.stats.proportion import confint_proportions_2indep
 
-from cavin_pyro.reproduction.cells import REWARDS, TASKS, TOP_ROW_OBJECTS
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.table import REFERENCE
+from cavin_pyro.reproduction.sizes import REWARDS, TASKS, TOP_ROW_OBJECTS
+from cavin_pyro.reproduction.statistics import REFERENCE
 
 LEADS = {  # points between CAVIN and the second best, 3 objects
     "sparse": {"clearing": 20.1, "insertion": 14.6, "crossing": 11.1},

@@ -11,8 +11,8 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cavin_pyro.reproduction.cells import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.reproduction.methods import METHODS, Method
+from cavin_pyro.reproduction.sizes import REWARDS, TOP_ROW_OBJECTS
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 
 GROUP_WIDTH = 0.8  # of the bars of all methods side by side

@@ -20,8 +20,9 @@ from cavin_pyro.config.device import set_matmul_precision
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.evaluation.evaluation import run_missing
 from cavin_pyro.launching.workers import of_shard, run_jobs
-from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, SIZES, Cell, Size, cells
+from cavin_pyro.reproduction.cells import SCENES_PER_TRAINING, Cell, cells
 from cavin_pyro.reproduction.methods import METHODS
+from cavin_pyro.reproduction.sizes import SIZES, Size
 from cavin_pyro.reproduction.table import TABLE, as_table, episode_row, write_table
 from cavin_pyro.storage.files import clear_abandoned
 from cavin_pyro.storage.progress import progress_bar

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from cavin_pyro.reproduction.cells import PLANNERS, TOP_ROW_OBJECTS
+from cavin_pyro.reproduction.cells import PLANNERS
 from cavin_pyro.reproduction.claims import claims
 from cavin_pyro.reproduction.figure import TITLES, draw_figure
 from cavin_pyro.reproduction.methods import METHODS
-from cavin_pyro.reproduction.table import CELL, CRITERIA, paired_tests, rates
+from cavin_pyro.reproduction.sizes import TOP_ROW_OBJECTS
+from cavin_pyro.reproduction.statistics import paired_tests, rates
+from cavin_pyro.reproduction.table import CELL, CRITERIA
 from cavin_pyro.storage.files import atomic_write, write_json
 
 HEAD = """# The paper's experiments

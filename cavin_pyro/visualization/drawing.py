@@ -157,13 +157,14 @@ def project(world: World, points: Floats) -> NDArray[np.float64]:
 def legend(world: World, records: list[PlanRecord]) -> list[Line2D]:
     """Entries for what `draw_plan` draws, and nothing else; at most six."""
     plans = [record.plan for record in records]
+    still = np.repeat(records[0].centers[None], plans[0].actions.shape[1], axis=0)
     shown: Mapping[str, tuple[bool, Style]] = {
         "target": (single_target(world), TARGET),
         "candidates": (any(plan.candidate_centers.numel() for plan in plans), CANDIDATE),
         "subgoals": (any(plan.subgoals.centers.numel() for plan in plans), SUBGOALS),
         "predicted": (any(plan.predicted_centers.numel() for plan in plans), PREDICTED),
         "reached": (True, REACHED),
-        world.step_names[0]: (world.arrows(plans[0].actions[0].numpy(), _still(records[0])) is not None, ACTION),
+        world.step_names[0]: (world.arrows(plans[0].actions[0].numpy(), still) is not None, ACTION),
     }
     return [Line2D([], [], label=name, **style) for name, (drawn, style) in shown.items() if drawn]
 
@@ -233,10 +234,6 @@ def finish(path: Path, figure: Figure, handles: list[Line2D]) -> None:
     """Put the legend below, and write the picture."""
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), **LEGEND)
     save_figure(path, figure)
-
-
-def _still(record: PlanRecord) -> Floats:
-    return np.repeat(record.centers[None], record.plan.actions.shape[1], axis=0)
 
 
 def _draw_actions(panel: Axes, world: World, arrows: Floats | None) -> None:

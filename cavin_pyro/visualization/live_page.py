@@ -20,7 +20,6 @@ from omegaconf import DictConfig
 
 from cavin_pyro.config.composition import presets
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.envs.pusht.policy import OUTLINE, SIZE
 from cavin_pyro.envs.tabletop.pushing import PushingEnv
 from cavin_pyro.envs.tabletop.scene import COLORS
 from cavin_pyro.envs.tabletop.workspace import TABLE_CENTER, TABLE_HIGH, TABLE_LOW, TILE_SIDE, tile_center
@@ -29,10 +28,9 @@ from cavin_pyro.visualization import drawing
 from cavin_pyro.visualization.live import AS_GIVEN, LiveLoop
 
 HOST = "127.0.0.1"
-TABLE_COLOR, GOAL_COLOR = "#C2B9AD", "#F2C200"
+TABLE_COLOR = "#C2B9AD"
 GIZMO = 0.15  # metres; size of the arrows that move a goal
-RAISED = 0.012  # metres above the table, so that paths are not hidden in it
-THICK = 0.005  # metres, of lines
+RAISED, THICK = 0.012, 0.005  # metres; of lines, above the table so that they are not hidden in it
 TOOL = 0.30  # metres; length of what stands for the robot's tool
 
 
@@ -215,20 +213,17 @@ class Page(EpisodeCallback):
                 self._bodies.append(self.scene.add_mesh_simple(f"/object{number}", *shape, color=color))
         else:
             self._size = self.world.render().shape[:2]
-        turning = goals.shape[1] == 3
-        arrows = {"active_axes": (True, True, False), "disable_rotations": not turning, "depth_test": False}
+        arrows = {"active_axes": (True, True, False), "disable_rotations": goals.shape[1] < 3, "depth_test": False}
         self.gizmos = [self.scene.add_transform_controls(f"/goal{n}", GIZMO, **arrows) for n in range(len(goals))]
         for gizmo in self.gizmos:
             gizmo.on_update(self._moved)
-            for name, part in (("bar", OUTLINE[[0, 2]]), ("stem", OUTLINE[[3, 5]])) if turning else ():  # of the T
-                place, size = part.mean(0) / (SIZE, -SIZE), np.abs(part[1] - part[0]) / SIZE
-                style = {"opacity": 0.5, "position": (*place, 0.0)}
-                self.scene.add_box(f"{gizmo.name}/{name}", rgb(GOAL_COLOR), (*size, 0.01), **style)
         self._place_goals()
 
     def _place_goals(self) -> None:
-        """Put tiles and arrows where the goals are."""
+        """Put tiles and arrows where the goals are; other worlds show them in their pictures."""
         self.scene.remove_by_name("/tiles")
+        if self._table is None and self.gizmos:
+            self.on_frame()
         for height, group in enumerate(self._table.task.tile_groups() if self._table is not None else (), 1):
             for i, j in group.tiles:
                 style = {"opacity": group.opacity, "position": (*tile_center((i, j)), 0.0005 * height)}

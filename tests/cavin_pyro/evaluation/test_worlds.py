@@ -75,23 +75,18 @@ def test_what_a_world_of_ones_own_raises_and_a_planner_that_does_not_suit_it_are
         def plan(self, state: Any, **given: Any) -> Any:
             return super().plan(state, **given)._replace(actions=torch.zeros(3, 2))
 
-    class Blind(Point):
-        def render(self) -> Any:
-            return "no picture"
-
     scripted = PolicyPlanner(ScriptedPush(), action_dimension=2)
     guided = CavinPlanner(model(), samples=8, horizon=6, additions=["guidance"])
     for world, planner, seed, said in (
         (Broken(), Right(action_dimension=2), 0, "^RuntimeError: the arm is stuck; --traceback shows where$"),
         (Point(), Misplaced(action_dimension=2), 0, r"^Misplaced\.plan must return actions \[1, T, 2\], all finite"),
-        (Blind(), Right(action_dimension=2), 0, r"^Blind\.render must return a picture .*, or None, not str$"),
         (Point(), scripted, 0, "^planner=scripted knows the ways of the tabletop alone"),
         (Point(), guided, 0, "^the addition guidance needs a reward"),
         (PushingEnv(), CavinPlanner(model(), samples=8, horizon=6), 0, "^the planner's model is of a world with other"),
         (Point(), Right(action_dimension=2), -1, "^seed must be a whole number of at least 0"),
     ):
         with pytest.raises(UserError, match=said):
-            rollout(world, planner, seed=seed, photograph=True)
+            rollout(world, planner, seed=seed)
 
 
 def test_the_cascade_plans_from_the_state_and_the_goal_of_a_world() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.reproduction.cells import PLANNERS, SIZES, cells
+from cavin_pyro.reproduction.cells import PLANNERS, cells
 from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.reproduction.pipeline import (
     SHARED,
@@ -19,6 +19,7 @@ from cavin_pyro.reproduction.pipeline import (
     preparation,
     training,
 )
+from cavin_pyro.reproduction.sizes import SIZES
 
 PAPER_METHODS = [name for name, method in METHODS.items() if method.in_paper]
 

@@ -15,9 +15,10 @@ import pytest
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
-from cavin_pyro.reproduction.cells import SIZES, cells
+from cavin_pyro.reproduction.cells import cells
 from cavin_pyro.reproduction.pipeline import Stage, run_stages
 from cavin_pyro.reproduction.results import write_results
+from cavin_pyro.reproduction.sizes import SIZES
 from cavin_pyro.reproduction.table import as_table, chosen_rows, episode_row, read_table, write_table
 
 WHOLE = ("scale=smoke", "methods=[mpc]", "planners=[paper]", "tasks=[clearing]", "objects=[1,3]", "workers=1")

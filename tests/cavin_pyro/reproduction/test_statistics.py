@@ -8,7 +8,8 @@ import pytest
 
 from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.reproduction.claims import claims, difference
-from cavin_pyro.reproduction.table import as_table, hierarchical_interval, paired_tests, rates
+from cavin_pyro.reproduction.statistics import hierarchical_interval, paired_tests, rates
+from cavin_pyro.reproduction.table import as_table
 
 WON, LOST = "success", "timeout"
 
