@@ -12,7 +12,7 @@ from cavin_pyro.config.application import guarded
 from cavin_pyro.config.errors import UserError
 
 ORDER = (
-    *("plan", "imagine", "evaluate", "compare"),
+    *("quickstart", "plan", "imagine", "evaluate", "compare"),
     *("collect", "data", "pretrain", "train", "check"),
     *("reproduce", "assets"),
 )

@@ -109,7 +109,7 @@ class Space:
     def locate(self, state: State) -> Tensor:
         """Positions `[..., M, P]` from the origin, or from object 0 in its axes, in units of `length`."""
         if not self.turning:
-            return self._from_origin(state.centers)
+            return self.from_origin(state.centers)
         return self.turn((state.centers - state.centers[..., :1, :]) / self.length, state)
 
     def describe(self, state: State, located: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ class Space:
         waves = [2.0**octave * math.pi * located for octave in range(self.frequencies)]
         parts = [located, *[wave.sin() for wave in waves], *[wave.cos() for wave in waves]]
         if self.turning:
-            parts.append(self._from_origin(state.centers))
+            parts.append(self.from_origin(state.centers))
         return torch.cat(parts, -1) if len(parts) > 1 else located
 
     def turn(self, vectors: Tensor, state: State, *, back: bool = False, dims: int = 1) -> Tensor:
@@ -141,7 +141,8 @@ class Space:
         parts = actions.split(list(self.action_sizes), -1)
         return torch.cat([self.turn(part, state, back=back, dims=dims) for part in parts], -1)
 
-    def _from_origin(self, centers: Tensor) -> Tensor:
+    def from_origin(self, centers: Tensor) -> Tensor:
+        """Positions `[..., M, P]` from the origin, in units of `length`."""
         # Raw coordinates may differ by a few hundredths of their size; centring and scaling makes such differences
         # visible to a network. Filled where the centres are: a copy from the CPU would let a GPU wait, and CUDA graphs
         # have none.

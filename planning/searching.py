@@ -55,7 +55,7 @@ class SearchingPlanner(ABC):
     samples: N, plans to compare.
     horizon: H steps, a multiple of the model's T.
     shrinking_horizon: plan no farther than to the end of the episode, H at most the steps that are left.
-    optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `evolution`, `smc`, or a
+    optimizer: searches the plans: `shooting` (paper), `cem`, `icem`, `mppi`, `smc`, or a
         `cavin_pyro.planning.optimizers.Optimizer`.
     reward_at: `path` rewards interpolated states as well (paper), `subgoals` only the end of each segment (published
         implementation).

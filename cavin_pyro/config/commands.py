@@ -315,7 +315,20 @@ class ReproduceConfig(DeviceOptions):
     table: str | None = option(None, "a table of episodes, episodes.parquet, to draw and count; nothing is run then")
 
 
+@dataclass
+class QuickstartConfig(LaunchOptions):
+    """Options of `python -m cavin_pyro.quickstart`."""
+
+    defaults: list[Any] = preset_defaults("world=tabletop")
+    minutes: int = option(20, "how long it takes on two idle cores", choices=("10", "20"))
+    episodes: int = option(20, "episodes of each task, to see what comes out", minimum=1)
+    output: str | None = option(None, FOLDER)
+    world: Any = None
+    seed: int = seed_option("seed of data and training")
+
+
 COMMANDS: dict[str, type] = {
+    "quickstart": QuickstartConfig,
     "collect": CollectConfig,
     "pretrain": PretrainConfig,
     "train": TrainConfig,

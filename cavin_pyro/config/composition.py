@@ -32,6 +32,7 @@ OUTPUT = {  # the folder of a run for which the user names none
     "plan": "runs/plan/{task}-{reward}-{objects}-{planner}-{seed}",
     "evaluate": "runs/evaluate/{task}-{reward}-{objects}-{planner}-{seed}",
     "reproduce": "runs/reproduce/{scale}",
+    "quickstart": "runs/quickstart/pushes-{minutes}-{seed}",
 }
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
 SAME_RUN = {"output", "workers", "transitions", "sections", "episodes", "video", "video_format", "viewer", "port"}

@@ -19,6 +19,7 @@ from cavin_pyro.config.options import options, shown
 
 WIDTH, INDENT = 100, 34  # columns
 EXAMPLES = {
+    "quickstart": ("minutes=10", "env=pusht", "env._target_=my.World output=runs/mine"),
     "collect": ("transitions=100000 workers=2", "env.objects=random output=data/random", "transitions=200000"),
     "pretrain": ("data=data/pushes", "data=[data/pushes,data/random]", "held_out_objects=[mug,banana]"),
     "train": ("data=data/pushes", "model=flat guide=flat", "trainer.steps=200000 trainer.batches=bucketed"),

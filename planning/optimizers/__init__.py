@@ -8,7 +8,6 @@ from __future__ import annotations
 from cavin_pyro.models.checks import check_choice
 from cavin_pyro.planning.optimizers.base import Optimizer, Shooting, samples_of_iteration
 from cavin_pyro.planning.optimizers.cem import CEM, ICEM
-from cavin_pyro.planning.optimizers.evolution import Evolution
 from cavin_pyro.planning.optimizers.mppi import MPPI
 from cavin_pyro.planning.optimizers.smc import SMC
 
@@ -18,7 +17,6 @@ __all__ = [
     "MPPI",
     "OPTIMIZERS",
     "SMC",
-    "Evolution",
     "Optimizer",
     "Shooting",
     "make_optimizer",
@@ -29,7 +27,6 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
     "cem": CEM,
     "icem": ICEM,
     "mppi": MPPI,
-    "evolution": Evolution,
     "smc": SMC,
 }
 
@@ -48,6 +45,6 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
             f"{argument} must be one of {', '.join(OPTIMIZERS)}, or an object with a method "
             f"optimize(problem, samples), not {optimizer!r}"
         )
-    if isinstance(optimizer, CEM | MPPI | Evolution):
+    if isinstance(optimizer, CEM | MPPI):
         samples_of_iteration(samples, optimizer.iterations, 0)
     return optimizer

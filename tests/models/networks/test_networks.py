@@ -14,13 +14,10 @@ from cavin_pyro.envs.tabletop.robots.robot import STICK_RADIUS
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.tabletop.workspace import TABLE_CENTER as CENTER
 from cavin_pyro.models.networks.contact.geometry import PUSH_UNIT, TABLE_CENTER, TOOL_RADIUS
-from cavin_pyro.models.networks.dynamics import (
-    ActionGenerator,
-    Dynamics,
-    StateChange,
-)
+from cavin_pyro.models.networks.dynamics import ActionGenerator, Dynamics, Outcome, StateChange
 from cavin_pyro.models.networks.layers import StateEncoder, neighbours
 from cavin_pyro.models.networks.pointnet import PointNet, PointNetAutoencoder, chamfer_distance
+from cavin_pyro.models.networks.residual import ResidualDynamics
 from cavin_pyro.models.state import State
 
 SIZES = {"feature_dimension": 6, "width": 8}
@@ -57,9 +54,13 @@ def test_neighbours_are_the_nearest_others_that_are_real(
             assert sorted(mine) == sorted(others[:most])
 
 
+@pytest.mark.parametrize("kind", [Dynamics, ResidualDynamics])
 @pytest.mark.parametrize("most", [None, 2])
-def test_order_and_padding_leave_features_and_predictions(random_state: Callable[..., State], most: int | None) -> None:
-    encoder, dynamics = small_encoder(most), Dynamics(SPACE, **SIZES).double()
+def test_order_and_padding_leave_features_and_predictions(
+    random_state: Callable[..., State], most: int | None, kind: type[Outcome]
+) -> None:
+    encoder, dynamics = small_encoder(most), kind(SPACE, **SIZES).double()
+    dynamics.neighbours = most
     state, action = double(random_state(3, objects=4, real=3)), torch.randn(3, 4, dtype=torch.float64)
     shuffled = state.map(lambda field: field[:, ORDER])
     assert torch.allclose(encoder(shuffled), encoder(state)[:, ORDER], atol=1e-12)
@@ -71,6 +72,8 @@ def test_order_and_padding_leave_features_and_predictions(random_state: Callable
     for field, expected in zip(dynamics(shuffled, encoder(shuffled), action), predicted, strict=True):
         assert torch.allclose(field, expected[:, ORDER], atol=1e-12)
     assert torch.equal(predicted.centers[:, 3], state.centers[:, 3])
+    for field, expected in zip(dynamics(short, encoder(short), action), predicted, strict=True):
+        assert torch.allclose(field, expected[:, :3], atol=1e-12)
 
 
 def test_an_object_alone_has_no_relations_and_other_features_are_refused(random_state: Callable[..., State]) -> None:

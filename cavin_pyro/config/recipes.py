@@ -1,0 +1,92 @@
+"""What `quickstart` runs: the commands from an empty folder to a planner, by world and number of minutes.
+
+Minutes are those of two idle cores. docs/results.md has what comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig
+
+from cavin_pyro.config.options import constructor_options, flat_options, shown
+
+
+class Recipe(NamedTuple):
+    """Options as typed. sizes: by minutes, transitions to collect and steps of training. tasks: one evaluation each."""
+
+    collect: str
+    train: str
+    plan: str
+    sizes: dict[int, tuple[int, int]]
+    tasks: tuple[str, ...] = ("",)
+
+
+class Step(NamedTuple):
+    """A command with its options, and the minutes that it takes."""
+
+    command: str
+    options: list[str]
+    minutes: float
+
+
+TRAINER = "trainer.batch_size=256 trainer.schedule=cosine trainer.validate_every=500"
+FLOW = f"prior=flow trainer.learning_rate=1e-3 {TRAINER}"
+TABLETOP = Recipe(
+    collect="",
+    train="geometry=outline dynamics=contact dynamics.equivariant=true scales=predicted prior=mixture "
+    "objective=rollout trainer.reflect=true trainer.batches=bucketed trainer.matmul_precision=bfloat16 "
+    f"trainer.learning_rate=2e-3 trainer.clip_norm=10000 windows.negative_fraction=0.5 {TRAINER}",
+    plan="",
+    sizes={10: (10_000, 3_300), 20: (20_000, 7_000)},
+    tasks=("task=clearing", "task=insertion", "task=crossing"),
+)
+WORLDS = {
+    "pusht": Recipe(
+        collect="env.criterion=none steps=60",
+        train="dynamics=residual prior.width=64 prior.transforms=6 model.width=128 guide.width=128 "
+        f"model.effect_dimension=8 model.motion_dimension=8 {FLOW}",
+        plan="planner.horizon=15 planner.shrinking_horizon=true planner.reward_at=subgoals planner.samples=2048 "
+        "planner.optimizer=icem planner.optimizer.iterations=10 planner.optimizer.elite_fraction=0.03",
+        sizes={10: (100_000, 4_000), 20: (300_000, 9_000)},
+    ),
+    "maze": Recipe(
+        collect="steps=100",
+        train=f"model.width=64 guide.width=64 model.effect_dimension=4 model.motion_dimension=4 {FLOW}",
+        plan="planner.horizon=60 planner.motion_horizon=first_segment planner.samples=4096",
+        sizes={10: (50_000, 3_000), 20: (100_000, 8_000)},
+    ),
+}
+OWN = Recipe("", FLOW, "", {10: (20_000, 3_000), 20: (100_000, 8_000)})
+
+
+def steps_of(config: DictConfig, home: Path) -> Iterator[Step]:
+    """The commands of `quickstart` in their order; each writes into a folder of `home`."""
+    world: dict[str, Any] = dict(config.world)
+    target = world.pop("_target_") or ""
+    name = target.split(".")[2] if target.startswith("cavin_pyro.envs.") else ""
+    recipe, env = WORLDS.get(name, OWN) if target else TABLETOP, [f"env={name}" if name else f"env._target_={target}"]
+    usual = constructor_options(target)
+    env += [
+        f"env.{option}={shown(value)}"
+        for option, value in flat_options(world).items()
+        if option not in usual or usual[option].default != value
+    ]
+    env = env if target else []
+    minutes, seed, workers = int(config.minutes), f"seed={config.seed}", f"workers={config.workers}"
+    transitions, steps = recipe.sizes[minutes]
+    checkpoint = f"checkpoint={home / 'train' / 'checkpoint.safetensors'}"
+
+    def step(command: str, place: str, share: float, given: str, *more: str) -> Step:
+        return Step(command, [*given.split(), *more, f"output={home / place}"], share * minutes)
+
+    collect = " ".join([*env, recipe.collect])
+    yield step("collect", "data", 0.2, collect, f"transitions={transitions}", seed, workers)
+    yield step("train", "train", 0.7, recipe.train, f"trainer.steps={steps}", f"data={home / 'data'}", seed)
+    for task in recipe.tasks:
+        planning, name = " ".join([*env, task, recipe.plan]), task.partition("=")[2]
+        more = (checkpoint, f"episodes={config.episodes}", "seed=20000", workers)
+        yield step("evaluate", f"evaluate{name and '-'}{name}", 0.08 / len(recipe.tasks), planning, *more)
+    yield step("plan", "episode", 0.02, planning, checkpoint, "seed=20000")
