@@ -38,7 +38,7 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
 
 
 def check_kinds(given: Mapping[str, Any], hints: Mapping[str, Any], error: type[Exception] = ValueError) -> None:
-    """Raise an `error` unless each value is of the type, such as `Sequence[int] | None`, of its annotation in `hints`."""
+    """Raise an `error` unless each value is of the type, `Sequence[int] | None` or the like, of `hints`."""
     for name in given.keys() & hints.keys():
         if not _fits(given[name], hints[name]):
             wanted = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name])
