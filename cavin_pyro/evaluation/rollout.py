@@ -175,7 +175,6 @@ def rollout(
     device = choose_device(device) if isinstance(device, str) else device
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
-        check_number("pushes_per_plan", 1 if pushes_per_plan is None else pushes_per_plan, 1, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
     if getattr(getattr(planner, "model", None), "space", env.space) != env.space:
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
