@@ -19,7 +19,7 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.files import output_folder
 
     collection = _collection(config)
-    with output_folder(config.output) as folder:
+    with output_folder(config.output, "a dataset") as folder:
         metadata = collect(collection, folder, transitions=config.transitions, workers=config.workers)
         print(f"{metadata['transitions']} transitions in {metadata['episodes']} episodes, in {folder}")
 

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
-from collections.abc import Iterable, Mapping
+import re
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from numbers import Integral, Real
-from typing import Any
+from types import UnionType
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+P = ParamSpec("P")
+T = TypeVar("T")
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 def check_number(
@@ -28,9 +37,41 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
         raise ValueError(f"unknown {name} {value!r}: choose from {', '.join(map(str, choices))}")
 
 
-def check_kinds(given: Mapping[str, Any], kinds: Mapping[str, tuple[type, ...]]) -> None:
-    """Raise ValueError unless each value that `kinds` names is None or of one of its types."""
-    for name, allowed in kinds.items():
-        if not isinstance(given[name], (*allowed, type(None))):
-            wanted = " or ".join(one.__name__ for one in allowed)
-            raise ValueError(f"{name} must be of type {wanted}, not {given[name]!r}")
+def check_kinds(given: Mapping[str, Any], hints: Mapping[str, Any], error: type[Exception] = ValueError) -> None:
+    """Raise an `error` unless each value is of the type, `Sequence[int] | None` or the like, of `hints`."""
+    for name in given.keys() & hints.keys():
+        if not _fits(given[name], hints[name]):
+            wanted = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name])
+            wanted = re.sub(r"\b(\w+\.)+", "", wanted)
+            raise error(f"{name} must be of type {wanted}, not {reprlib.repr(given[name])}")
+
+
+def typed(error: type[Exception]) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorate a function: an argument that is not of the type of its annotation is an `error` of one line."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        signature, hints = inspect.signature(function), functools.cache(functools.partial(get_type_hints, function))
+        names = [name for name, one in signature.parameters.items() if one.kind not in VARIADIC]
+
+        @functools.wraps(function)
+        def called(*arguments: P.args, **keywords: P.kwargs) -> T:
+            given = signature.bind(*arguments, **keywords).arguments
+            check_kinds({name: given[name] for name in names if name in given}, hints(), error)
+            return function(*arguments, **keywords)
+
+        return called
+
+    return decorate
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of an annotation's type, as are the entries of a sequence."""
+    kind, inner = get_origin(hint) or hint, get_args(hint)
+    if kind in (Union, UnionType):
+        return any(_fits(value, one) for one in inner)
+    if kind in (list, tuple, Sequence) and inner:
+        listed = isinstance(value, Sequence) and not isinstance(value, str | bytes)
+        return listed and all(_fits(one, inner[0]) for one in value)
+    if kind in (int, float):
+        return isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+    return not isinstance(kind, type) or kind is Any or isinstance(value, kind)

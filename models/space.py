@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_type_hints
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_kinds, check_number
 from cavin_pyro.models.state import State
 
 
@@ -59,6 +60,7 @@ class Space:
     frequencies: int = 0
 
     def __post_init__(self) -> None:
+        check_kinds(vars(self), get_type_hints(type(self)))
         for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         parts = (self.action_names, self.action_limits, self.action_scales)
@@ -79,8 +81,8 @@ class Space:
             check_number("action_sizes of a space", value, 1, whole=True)
         check_number("unit_features of a space", self.unit_features or 0, whole=True)
         check_number("frequencies of a space", self.frequencies, 0, 24, whole=True)  # float32 tells no shorter waves
-        if not self.origin or not isinstance(self.turning, bool):
-            raise ValueError("a space has an origin [P] of at least a number, and turning is True or False")
+        if not self.origin:
+            raise ValueError("a space has an origin [P] of at least a number")
         if self.turning and (self.positions < 2 or any(size != 2 for size in self.action_sizes)):
             raise ValueError("a turning space has positions of at least 2 numbers, and actions in parts of 2")
 

@@ -17,6 +17,7 @@ import re
 import signal
 import sys
 import threading
+import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -149,7 +150,18 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
         return f"{', '.join(about)}: {said}" if about else said
     if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
         return _refusal(error)
-    return one_line(error) if lacks_memory(error) else None
+    if lacks_memory(error):
+        return one_line(error)
+    variable = _of_environment(error)
+    return f"{variable} in the environment: {one_line(error)[:200]}: unset it" if variable else None
+
+
+def _of_environment(error: Exception) -> str | None:
+    """The variable of a library, TQDM_NCOLS=x or the like, of whose value an error in that library complains."""
+    frames = traceback.walk_tb(error.__traceback__)
+    begins = tuple(f"{frame.f_globals.get('__name__', '').partition('.')[0]}_".upper() for frame, _ in frames)
+    named = (one for one in os.environ.items() if one[0].startswith(begins) and one[1] and one[1] in str(error))
+    return next((f"{name}={value[:80]}" for name, value in named), None)
 
 
 def _refusal(error: OSError) -> str:

@@ -37,7 +37,11 @@ class WorldCollection:
         """The arrays of a shard, which its number and the configuration determine."""
         numbers = range(number * self.episodes_per_shard, (number + 1) * self.episodes_per_shard)
         world = _opened(json.dumps(self.world))
-        return packed([collected(world, self.seed, one, self.steps) for one in numbers], numbers, self.steps)
+        episodes = []
+        for number in numbers:
+            with user_input("env", where=f"episode {number} of seed={self.seed}"):
+                episodes.append(collected(world, self.seed, number, self.steps))
+        return packed(episodes, numbers, self.steps)
 
 
 @cache
@@ -54,7 +58,6 @@ def described(world: World, section: Mapping[Any, Any]) -> dict[str, Any]:
     return dict(json.loads(json.dumps(about)))
 
 
-@user_input("env")
 def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """One episode by the world's policy, of at most `steps`; it ends where the world ends it.
 

@@ -82,7 +82,7 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
 
 def _write(target: Path, episodes: Sequence[Arrays], steps: int, metadata: dict[str, Any]) -> None:
     """The metadata come last, so that a killed import leaves no dataset."""
-    with output_folder(target) as folder:
+    with output_folder(target, "a dataset") as folder:
         if (folder / "metadata.json").exists():
             raise UserError(f"{target} holds a dataset already: choose another folder with --to DIR")
         for number, first in enumerate(range(0, len(episodes), EPISODES)):

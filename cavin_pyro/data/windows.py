@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,12 @@ class WindowTable:
 
     Attributes:
         training, validation: indices of windows, for `batch`. episodes: the episode that each window is from.
-        device: of batches.
+        device: of batches. geometry: the fingerprint of what made the features; None if it is not known.
+        selection: of a dataset's, `windows` and the seed of the `split`, by which `check` finds the same ones.
     """
+
+    geometry: str | None = None
+    selection: Mapping[str, Any] = {}
 
     def __init__(
         self,
@@ -245,7 +250,9 @@ def load_windows(
             if made != metadata["transitions"]:
                 said = f"{made} transitions, and its metadata say {metadata['transitions']}"
                 raise UserError(f"{folder} has {said}: collect it again")
-    return WindowTable(**found.found())
+    table = WindowTable(**found.found())
+    table.geometry, table.selection = fingerprint or None, {"windows": asdict(config), "split": seed}
+    return table
 
 
 def shared_space(folders: Sequence[Path]) -> Space | None:

@@ -24,6 +24,7 @@ from cavin_pyro.evaluation.rollout import Episode
 from cavin_pyro.evaluation.rows import Row, finished_episodes
 from cavin_pyro.evaluation.statistics import plan_summary, summarize, table
 from cavin_pyro.launching.workers import of_shard, run_jobs
+from cavin_pyro.models.checks import typed
 from cavin_pyro.storage.files import atomic_write, output_folder, write_json
 from cavin_pyro.storage.progress import progress_bar
 from cavin_pyro.storage.provenance import provenance
@@ -35,6 +36,7 @@ ROUND = 5  # episodes of one evaluation before the next one's turn
 NOT_COMPARED = ("output", "episodes", "shard", "workers")  # may differ between runs of one evaluation
 
 
+@typed(UserError)
 def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]:
     """Run seeded episodes as the command `evaluate` does, and write their results to its folder; resumes a killed one.
 
@@ -53,7 +55,7 @@ def evaluate(config: DictConfig | None = None, **options: Any) -> dict[str, Any]
     Raises:
         UserError: an option out of its range, or a folder that holds another evaluation.
     """
-    if config is not None and (options or not isinstance(config, DictConfig) or "episodes" not in config):
+    if config is not None and (options or "episodes" not in config):
         raise UserError("evaluate takes options by their names, such as task='crossing', or only a configuration of it")
     config = compose("evaluate", **options) if config is None else config
     config.device = choose_device(config.device).type  # once, for all workers and for who resumes

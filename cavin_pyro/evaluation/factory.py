@@ -25,6 +25,7 @@ from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.world import ACTION_DECIMALS, World
 from cavin_pyro.evaluation.rollout import Episode, rollout
+from cavin_pyro.models.checks import typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Planner
@@ -63,6 +64,7 @@ def planner_name(config: DictConfig) -> str:
     return ", ".join(str(part["_target_"]).rpartition(".")[2] for part in parts if part.get("_target_"))
 
 
+@typed(UserError)
 def make_env(
     config: DictConfig | None = None, *, geometry: Geometry | None = None, render: bool = False, **options: Any
 ) -> World:
@@ -80,10 +82,8 @@ def make_env(
     Raises:
         UserError: an unknown task, layout or object, or a part of the world that lacks files.
     """
-    if config is not None and (options or not isinstance(config, DictConfig)):
+    if config is not None and options:
         raise UserError("make_env takes options by their names, such as task='crossing', or only a configuration")
-    if geometry is not None and not callable(geometry):
-        raise UserError(f"geometry must be that of a checkpoint, load(NAME).geometry, not {geometry!r}")
     config = compose("plan", **options) if config is None else config
     if (world := world_of(config)) is not None:
         pictures = render and type(world).render is not World.render
@@ -107,6 +107,7 @@ def make_env(
     return env
 
 
+@typed(UserError)
 def make_planner(
     model: Model | None,
     planner: str | Mapping[str, Any] = "cavin",

@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, UnsuitedError
 from cavin_pyro.planning.records import apply
@@ -134,6 +135,7 @@ class EpisodeCallback:
         """Called once, after the last push."""
 
 
+@typed(UserError)
 def rollout(
     env: World,
     planner: Planner,
@@ -170,14 +172,16 @@ def rollout(
             optimizer, a world or a planner of the user's own raises an error.
         RuntimeError: the robot stands in the camera's view.
     """
-    if not isinstance(env, World) or not hasattr(planner, "plan"):
-        given = f"{type(env).__name__} and {type(planner).__name__}"
-        raise UserError(f"rollout takes a world, as of make_env, and then a planner, as of make_planner, not {given}")
+    device = choose_device(device) if isinstance(device, str) else device
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
     if getattr(getattr(planner, "model", None), "space", env.space) != env.space:
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
+    if photograph and env.render_mode is None:
+        raise UserError(f"photograph=True needs a {type(env).__name__} with pictures: build it with render=True")
+    if start is not None and not env.observation_space.contains(start):
+        raise UserError("start must be an observation as of env.reset, or of env.step")
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
 

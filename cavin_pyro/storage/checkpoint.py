@@ -6,6 +6,7 @@ classes that it names must be defined in this program's packages, or in a module
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sysconfig
@@ -23,6 +24,7 @@ from torch import Tensor, contiguous_format, nn
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import amortized_guides, build_guide, build_model, construct, describe
 from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.checks import typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.networks.pointnet import PointNet
@@ -129,6 +131,7 @@ def checked_geometry(geometry: Any) -> Geometry:
     return geometry
 
 
+@typed(UserError)
 def save(
     path: str | Path,
     *,
@@ -156,11 +159,12 @@ def save(
             part contradicts. Nothing is written then.
     """
     parts = {"model": model, "guide": guide, "geometry": geometry, **others}
-    for (name, part), kind in zip(parts.items(), (Model, Guide, *[nn.Module] * len(parts)), strict=False):
-        if part is not None and not isinstance(part, kind):
-            raise UserError(f"{name} must be a {kind.__name__}, not {type(part).__name__}")
+    if wrong := [name for name, part in others.items() if not isinstance(part, nn.Module)]:
+        raise UserError(f"{wrong[0]} must be a Module, not {type(others[wrong[0]]).__name__}")
     if all(part is None for part in parts.values()) or (guide is not None and model is None):
         raise UserError(f"save needs {'a part' if guide is None else 'the model of this guide'}: give model=")
+    if not Path(path).parent.is_dir():
+        raise UserError(f"there is no folder for {path}: make it, or give another path")
     stored = dict(config or {})
     if model is not None and "model" not in stored:
         stored |= describe(model=model, guide=guide, geometry=geometry)
@@ -187,6 +191,7 @@ def save(
         temporary.write_bytes(safetensors.torch.save(tensors, metadata=header))
 
 
+@typed(UserError)
 def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
     """Read and check a checkpoint; no code of the file is run. Its parts are built when they are asked for.
 
@@ -200,8 +205,9 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
     Raises:
         UserError: missing, truncated, damaged or foreign file, another version, or a class of an untrusted module.
     """
-    if isinstance(trust, str) or not isinstance(trust, Sequence):  # a word is a sequence too, of letters
-        raise UserError(f'trust must be a list of modules, such as ["my_lab"] in Python, not {trust!r}')
+    for module in trust:
+        with user_input("trust", where=f"trust: module {module}"):
+            importlib.import_module(module)
     path = find_checkpoint(name_or_path)
     header, tensors = read_checkpoint(path)
     with user_input(where=f"checkpoint {path} has a damaged header"):

@@ -16,6 +16,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.lock import LOCK_NAME, folder_lock
 
 CONFIG_NAME = "config.yaml"  # the options of a run
+HELD = {"a run": CONFIG_NAME, "a dataset": "metadata.json"}  # by what a folder for results shows what it holds
 PARTIAL = ".partial"  # in the names of files that are being written
 OURS = ".cavin-"  # in the names of those that `atomic_write` makes, which alone are cleared away
 
@@ -60,12 +61,12 @@ def file_digest(path: Path) -> str:
 
 
 @contextmanager
-def output_folder(path: str | Path) -> Iterator[Path]:
+def output_folder(path: str | Path, holds: str = "a run") -> Iterator[Path]:
     """Hold a folder for results: it exists, is writable and is locked, and what a killed run left half-written is gone.
 
     A folder that was made for this and is still empty at the end is deleted, and so is one that holds nothing but its
     options when the command fails: a command that is refused, or that the memory does not allow, leaves nothing. A
-    `UserError` if the folder cannot be written, or another process writes into it.
+    `UserError` if the folder cannot be written, another process writes into it, or it `holds` something else.
     """
     folder = Path(path)
     with ExitStack() as held:
@@ -79,6 +80,8 @@ def output_folder(path: str | Path) -> Iterator[Path]:
             raise UserError(
                 f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
             ) from error
+        if other := [one for one, name in HELD.items() if one != holds and (folder / name).exists()]:
+            raise UserError(f"{folder} holds {other[0]}, not {holds}: choose another output=DIR")
         try:
             yield folder
         except BaseException:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cavin_pyro.config.errors import UserError
+from cavin_pyro.config.errors import UserError, one_line
 
 OWN_MODULES = ("cavin_pyro.models", "cavin_pyro.guides")
 OLDER_NAMES = ("models.", "guides.", "planning.", "envs.")  # of packages that had a top-level name before 0.2.0
@@ -81,6 +81,8 @@ def _is_class_of(target: str, modules: Sequence[str]) -> bool:
         found = getattr(importlib.import_module(name[0]), name[2], None)
     except ImportError:
         return False
+    except (Exception, SystemExit) as error:  # of a module of the user's
+        raise UserError(f"trust: module {name[0]} cannot be imported: {one_line(error)}") from error
     return isinstance(found, type) and any(_within(found.__module__, module) for module in modules)
 
 

@@ -32,7 +32,7 @@ from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
@@ -87,6 +87,7 @@ def train(config: DictConfig) -> Trainer:
         )
 
 
+@typed(UserError)
 def fit(
     model: Model,
     guide: Guide,
@@ -126,14 +127,14 @@ def fit(
         raise UserError(f"fit has no option {unknown[0]!r}: choose from {', '.join(vars(options))}")
     with user_input():
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
-        _check_parts(model, guide, windows)
+        _check_parts(model, guide, windows, geometry)
         objective = as_objective(Trace_ELBO(max_plate_nesting=1) if objective is None else objective)
         objective.check(model, guide)
     signs = _mirror_signs(options.reflect, geometry, guide)
     stored: Any = dict(config or {})
     if "model" not in stored and output is not None:
         parts = describe(model=model, guide=guide, geometry=geometry)
-        stored = {**parts, "trainer": vars(options), "seed": seed, **stored}
+        stored = {**parts, "trainer": vars(options), "seed": seed, **windows.selection, **stored}
     programs = nn.ModuleDict({"model": model, "guide": guide}).to(place_of)
     best: dict[str, Tensor] = {}
     with (
@@ -175,11 +176,12 @@ def fit(
     return run
 
 
-def _check_parts(model: Model, guide: Guide, windows: WindowTable) -> None:
-    """Raise ValueError for a guide of another model, or windows of other sizes than the model's."""
-    if not isinstance(model, Model) or not isinstance(guide, Guide) or not isinstance(windows, WindowTable):
-        given = ", ".join(type(one).__name__ for one in (model, guide, windows))
-        raise ValueError(f"fit takes a Model, its Guide and a WindowTable, in this order, not {given}")
+def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geometry | None) -> None:
+    """Raise an error for a guide of another model, or windows of other sizes or features than the model's."""
+    if geometry is not None:
+        check_fit(model, geometry)
+        if windows.geometry not in (None, geometry_fingerprint(geometry)):
+            raise ValueError(f"the windows' features are not of this {type(geometry).__name__}: give what made them")
     if guide.model is not model:
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
     one = windows.batch(windows.training[:1])

@@ -44,6 +44,7 @@ class LiveLoop(EpisodeCallback):
         self.world.maximum_steps = UNLIMITED
         self._model = None if config.planner.get("model_free") else load(config.checkpoint, trust=config.trust).model
         self._given, self._reward = config.planner, None  # no reward: the goal has moved since
+        self.chosen = AS_GIVEN  # of `planner=`
         self._asked: dict[str, Any] = {}
         self._changed = threading.Condition()
 
@@ -65,6 +66,7 @@ class LiveLoop(EpisodeCallback):
                     pass
             except NextScene:
                 self._observation = None
+                self.say("next scene")
 
     def on_observation(self, observation: Any) -> None:
         """Keep it, to go on from there."""
@@ -112,5 +114,5 @@ class LiveLoop(EpisodeCallback):
             config.planner.samples = int(samples or self.config.planner.get("samples", config.planner.samples))
         actions = self.world.space.actions
         self.planner = planner_of(config, self._model, self.runner.device, action_dimension=actions)
-        self.config = config
+        self.config, self.chosen = config, planner or self.chosen
         return f"{type(self.planner).__name__}, {config.planner.get('samples', 'no')} samples, from the next plan on"

@@ -115,8 +115,8 @@ class Page(EpisodeCallback):
         usual = int(loop.config.planner.get("samples", 1024))
         samples = gui.add_slider("Samples", 1, max(2048, usual), 1, usual)
         samples.on_update(lambda _: loop.ask(samples=samples.value))
-        planner = gui.add_dropdown("Planner", (AS_GIVEN, *presets("planner")))
-        planner.on_update(lambda _: loop.ask(planner=planner.value))
+        self._planner = gui.add_dropdown("Planner", (AS_GIVEN, *presets("planner")))
+        self._planner.on_update(lambda event: loop.ask(planner=self._planner.value) if event.client else None)
         kinds = {"candidates (click one)": drawing.CANDIDATE, "subgoals": drawing.SUBGOALS}
         kinds |= {"predicted": drawing.PREDICTED, "reached": drawing.REACHED}
         legend = (f'<span style="color:{style["color"]}">■</span> {name}' for name, style in kinds.items())
@@ -124,8 +124,10 @@ class Page(EpisodeCallback):
         self._depth = gui.add_image(np.zeros((4, 4, 3), np.uint8), label="Depth", visible=self._table is not None)
 
     def say(self, line: str) -> None:
-        """Show a line on the page; a goal that could not be moved returns to where it is."""
-        self._text.content = f"**{self.world.name}, scene {self.loop.seed}**  \n{line}"
+        """Show a line on the page; a goal or a planner that was refused returns to what it is."""
+        runs = "running" if self.loop.plans >= 1 else "paused"
+        self._text.content = f"**{self.world.name}, scene {self.loop.seed}, {runs}**  \n{line}"
+        self._planner.value = self.loop.chosen
         self._place_goals()
 
     def on_observation(self, observation: Any) -> None:

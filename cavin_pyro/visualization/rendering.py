@@ -67,8 +67,9 @@ def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: str
         video: format of the film, `mp4`, `gif` or `webp`; none is written of a world without pictures.
     """
     env = runner.env
-    film = Film(env) if video and env.render_mode is not None else None
-    episode = runner.rollout(seed, photograph=True, callbacks=[EpisodeProgress(env), *([film] if film else [])])
+    pictures = env.render_mode is not None
+    film = Film(env) if video and pictures else None
+    episode = runner.rollout(seed, photograph=pictures, callbacks=[EpisodeProgress(env), *([film] if film else [])])
     if isinstance(env, PushingEnv):
         write_steps(folder / "steps.csv", episode)
     with refusals(seed, env):

@@ -36,7 +36,7 @@ from cavin_pyro.envs.tabletop.workspace import (
     tile_center,
 )
 from cavin_pyro.envs.world import Geometry, World
-from cavin_pyro.models.checks import check_choice, check_kinds, check_number
+from cavin_pyro.models.checks import check_choice, check_number, typed
 from cavin_pyro.models.state import State
 
 EPISODE_STEPS = 60
@@ -49,17 +49,6 @@ SPECTATOR = Camera(  # opposite the robot, for pictures
     rotation=(1.03989, 0.0, 2.96450),
     intrinsics_offset=(225.0, 225.0, 0.0, 14.0),
 )
-KINDS: dict[str, Any] = {  # of arguments that choose parts
-    "tiles": (Mapping,),
-    "generated": (GeneratedLayouts,),
-    "ranges": (ObjectRanges, Mapping),
-    "object_set": (str, ObjectSet),
-    "assets": (str, Path),
-    "camera": (str, Camera, DepthSensor),
-    "segmentation": (str, Callable),
-    "robot": (str, Callable),
-}
-
 ObservationDict = dict[str, NDArray[Any]]
 
 
@@ -101,6 +90,7 @@ class PushingEnv(Uncopied, World):
     features = 64  # of `geometry`, which makes them of the clouds
     sees_clouds = True
 
+    @typed(ValueError)
     def __init__(
         self,
         *,
@@ -121,7 +111,6 @@ class PushingEnv(Uncopied, World):
         render_mode: str | None = None,
         robot: str | RobotFactory = "stick",
     ) -> None:
-        check_kinds(locals(), KINDS)
         check_number("objects", objects, 1, MAXIMUM_OBJECTS, whole=True)
         check_number("maximum_steps", maximum_steps, 1, whole=True)
         check_choice("render_mode", render_mode, (None, "rgb_array"))
@@ -163,6 +152,7 @@ class PushingEnv(Uncopied, World):
         self._observation: Observation | None = None
         self._steps = 0
 
+    @typed(ValueError)
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[ObservationDict, dict[str, Any]]:

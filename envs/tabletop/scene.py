@@ -214,6 +214,12 @@ class Scene(Uncopied):
     def capture(self) -> DepthImage:
         """Take a depth image without updating the observation's clouds; `true_masks` then refers to this image."""
         image, self._body_image = self.sensor.capture(self.world.render)
+        depth, bodies = np.asarray(image.depth), np.asarray(self._body_image)
+        if depth.dtype.kind != "f" or bodies.dtype.kind != "i" or depth.ndim != 2 or depth.shape != bodies.shape:
+            given = f"{depth.dtype} {[*depth.shape]} and {bodies.dtype} {[*bodies.shape]}"
+            raise ValueError(f"{type(self.sensor).__name__}: depth and bodies must be floats and integers, not {given}")
+        if not (depth >= 0).all() or depth.max() == np.inf:
+            raise ValueError(f"{type(self.sensor).__name__}: depth must be metres, and 0 where nothing is measured")
         return image
 
     def true_masks(self) -> list[NDArray[np.bool_]]:

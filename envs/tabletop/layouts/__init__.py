@@ -160,13 +160,17 @@ def _path(kind: type[Task], layout: int | str | Path) -> Path:
 
 def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        content, nodes = yaml.safe_load(text), getattr(yaml.compose(text, yaml.SafeLoader), "value", ())
     except OSError as error:
         raise ValueError(f"layout {path} cannot be read ({error.strerror}): give {_choices(kind)}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(f"layout {path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
         raise ValueError(f"layout {path} must hold the keys {', '.join(kind.layout_keys())}")
+    keys = [key.value for key, _ in nodes]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise ValueError(f"layout {path} has the key {twice[0]!r} twice: give it once")
     return content
 
 

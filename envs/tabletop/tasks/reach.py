@@ -24,7 +24,7 @@ Moves = Sequence[tuple[int, int, Mask]]
 def check_reach(task: Task) -> None:
     """Check that pushes along x and y can bring an object, alone on the table, from every start tile to the goal.
 
-    A way that is blocked for another reason than the tool's reach passes, as does a task with a goal for each object.
+    A task with a goal for each object passes.
 
     Raises:
         ValueError: from a start tile they cannot; it is named, and so is the tile where pushes end.
@@ -42,7 +42,9 @@ def check_reach(task: Task) -> None:
         for tile in getattr(task, name):
             start = np.linalg.norm(places - tile_center(tile), axis=-1)
             start = start == start.min()
-            if (solved[start] < 0).all() and (away[start] >= 0).any():
+            if (away[start] < 0).all():
+                raise ValueError(f"{name} tile {list(tile)}: no way leads to the goal: open one for it")
+            if (solved[start] < 0).all():
                 reached = _steps(start, free, pushes) >= 0
                 last = places[np.unravel_index(np.where(reached, away, away.max() + 1).argmin(), away.shape)]
                 stuck = np.rint((last - TILE_ORIGIN) / TILE_SIDE).astype(int).tolist()

@@ -233,9 +233,13 @@ PLANNING = "import cavin_pyro.plan as plan; plan.main()"
 
 @pytest.mark.parametrize(
     ("flags", "program", "status", "said"),
-    [("", IMPORTING, 130, "interrupted"), ("-OO", PLANNING, 2, "PYTHONOPTIMIZE=2")],
+    [
+        ("", IMPORTING, 130, "interrupted"),
+        ("-OO", PLANNING, 2, "PYTHONOPTIMIZE=2"),
+        ("", f"import os; os.environ['TQDM_NCOLS'] = 'x'; {PLANNING}", 2, "TQDM_NCOLS=x in the environment: "),
+    ],
 )
-def test_neither_an_interrupted_import_nor_stripped_docstrings_end_in_a_traceback(
+def test_neither_an_interrupted_import_nor_a_wrong_environment_ends_in_a_traceback(
     flags: str, program: str, status: int, said: str, tmp_path: Path
 ) -> None:
     (tmp_path / "slow.py").write_text(

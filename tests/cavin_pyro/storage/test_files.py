@@ -70,4 +70,5 @@ def test_a_run_that_fails_before_its_first_result_leaves_no_options_in_a_folder_
     assert left == ["earlier/config.yaml", "half/config.yaml", "half/row"]
     with output_folder(tmp_path / "whole") as folder:
         (folder / "config.yaml").touch()
-    assert (tmp_path / "whole" / "config.yaml").exists()
+    with pytest.raises(UserError, match="holds a run, not a dataset"), output_folder(tmp_path / "whole", "a dataset"):
+        pass

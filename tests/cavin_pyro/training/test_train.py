@@ -190,6 +190,10 @@ def test_programs_fitted_in_python_have_the_best_weights_and_resume_as_a_checkpo
         fit(model, guide, windows_by_hand(1), geometry=Outline(), **options)
     with pytest.raises(UserError, match=r"^fit has no option 'patients': choose from steps, .*, patience$"):
         fit(model, guide, windows_by_hand(), patients=2)
+    windows = windows_by_hand()
+    windows.geometry = "of another"
+    with pytest.raises(UserError, match=r"features are not of this Outline"):
+        fit(model, guide, windows, geometry=Outline())
 
 
 def test_an_automatic_guide_is_fitted_in_python_and_writes_nothing(tmp_path: Path, monkeypatch: Any) -> None:
