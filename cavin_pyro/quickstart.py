@@ -11,6 +11,7 @@ def main(config: DictConfig) -> None:
 
     It says each command that it runs, so that parts can be changed and run again. Resumes an interrupted run.
     """
+    import math
     import shlex
     import sys
     import time
@@ -30,12 +31,12 @@ def main(config: DictConfig) -> None:
         steps, begun = list(steps_of(config, home)), time.monotonic()
         torch.set_num_threads(2)  # of training; workers have one
         for number, step in enumerate(steps):
-            left = sum(one.minutes for one in steps[number:])
+            left = math.ceil(sum(one.minutes for one in steps[number:]))
             line = f"python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
-            print(f"\n{number + 1} of {len(steps)}, about {left:.0f} minutes to go: {line}", flush=True)
+            print(f"\n{number + 1} of {len(steps)}, about {left} min to go: {line}", flush=True)
             sys.argv = [f"{step.command}.py", *step.options]
             import_module(f"cavin_pyro.{step.command}").main()
-        print(f"\n{(time.monotonic() - begun) / 60:.1f} minutes in all, in {home}")
+        print(f"\n{(time.monotonic() - begun) / 60:.1f} min in all, in {home}")
 
 
 if __name__ == "__main__":
