@@ -29,7 +29,7 @@ def main(config: DictConfig) -> None:
         check_same_run(home, config, ignore=("output", "workers", "episodes"))
         write_config(home, config)
         steps, begun = list(steps_of(config, home)), time.monotonic()
-        torch.set_num_threads(2)  # of training; workers have one
+        torch.set_num_threads(min(2, config.workers))  # of training; its steps are too small for more
         for number, step in enumerate(steps):
             left = math.ceil(sum(one.minutes for one in steps[number:]))
             line = f"python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
