@@ -71,6 +71,7 @@ class Row:
 PAPER = ("planner=paper", "planner.motion_horizon=full_horizon", "checkpoint=cavin")
 PAPERS_WORLD = ("env.robot=sawyer", "env.objects=ycb", "env.camera=kinect2", "env.segmentation=clusters")
 TASKS = ("clearing", "insertion", "crossing")
+MADE = "checkpoint=runs/quickstart/pushes-20-{}/train/checkpoint.safetensors"  # by quickstart seed=0, 1 and 2
 
 
 def of_each_task(name: str, *options: str, objects: int = 3) -> list[Row]:
@@ -88,6 +89,7 @@ SUCCESS = [
     *of_each_task("script without a model, 3 objects", "planner=scripted"),
     *of_each_task("script without a model, 5 objects", "planner=scripted", objects=5),
     *of_each_task("random pushes", "planner=random"),
+    *(row for seed in range(3) for row in of_each_task(f"quickstart, seed {seed}", MADE.format(seed))),
 ]
 
 

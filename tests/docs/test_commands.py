@@ -1,7 +1,7 @@
 """Every command and every block of Python in README and documentation runs, in the order of its page.
 
 A page is a test with a folder of its own. Options that make a command small are added to it. A page that uses data or
-a model which none of its commands makes gets those of the README's commands. A block of Python that begins with a
+a model which none of its commands makes gets those of TRAINING. A block of Python that begins with a
 file's name is written to that file (`continued` adds to it), as is one of YAML; the others run as one script after the
 page's commands. What does not run is in NOT_RUN, with its reason.
 """
@@ -40,6 +40,7 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     "env.assets=": "needs files from publishers",
     "viewer=live": "runs until Ctrl-C; tests/cavin_pyro/visualization runs it",
     "maze": "needs an extra; tests/envs runs it",
+    "quickstart": "takes minutes; tests/cavin_pyro/commands runs it",
     "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
     "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",
     "cavin_pyro.data import": "needs an extra; tests/cavin_pyro/data runs it",
@@ -47,7 +48,8 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     "rsync ": "of the shell",
     "mkdir ": "of the shell",
 }
-MADE = ("runs/train", "runs/pretrain", "data/pushes")  # by the README's commands
+MADE = ("runs/train", "runs/pretrain", "data/pushes")  # by TRAINING
+TRAINING = ROOT / "docs" / "how-to" / "collect-and-train.md"
 SHORTER = {  # in blocks of Python
     "episodes=20, workers=1": 'episodes=1, workers=1, maximum_steps=1, **{"planner.samples": 8}',
     "steps=2000": "steps=2, batch_size=8",
@@ -72,7 +74,8 @@ def small(line: Line) -> Case:
         return Case({"data": "data.__main__"}.get(line.command, line.command), line.options)
     assert line.command is not None, line
     more = SMALL[line.command].split()
-    given = {option.partition("=")[0] for option in line.options}
+    options = [option.replace("runs/quickstart/pushes-20-0/data", "data/pushes") for option in line.options]
+    given = {option.partition("=")[0] for option in options}
     more = [option for option in more if not (option.startswith("seed=") and "seed" in given)]
     if "planner=random" in line.options:
         more.remove("planner.samples=16")
@@ -80,15 +83,12 @@ def small(line: Line) -> Case:
         more = [option for option in more if not option.startswith(("maximum_steps=", "windows.minimum_move="))]
     more += ["device=cpu"] if "device=cuda" in line.options else []
     more += ["planner.compile=false"] if "planner.compile=true" in line.options else []
-    return Case(line.command, [*line.options, *more])
+    return Case(line.command, [*options, *more])
 
 
 def runnable(page: Path) -> list[Line]:
-    """The page's commands that run, each once, and those of the README on its page alone."""
-    known = set() if page.name == "README.md" else {line.tokens for line in commands(ROOT / "README.md")}
-    return [
-        *{line.tokens: line for line in commands(page) if reason(line) is None and line.tokens not in known}.values()
-    ]
+    """The page's commands that run, each once."""
+    return [*{line.tokens: line for line in commands(page) if reason(line) is None}.values()]
 
 
 def blocks(page: Path) -> Iterator[tuple[str, str]]:
@@ -122,29 +122,30 @@ def run(lines: list[Line], folder: Path) -> None:
 
 
 @functools.cache
-def readme_folder(parent: Path) -> Path:
-    """A folder in which the README's commands have run."""
-    folder = parent / "readme"
+def trained(parent: Path) -> Path:
+    """A folder in which the commands that make data and models have run."""
+    folder = new_folder(parent / "made")
+    run([line for line in runnable(TRAINING) if any(f"output={made}" in line.options for made in MADE)], folder)
+    return folder
+
+
+def new_folder(folder: Path) -> Path:
     folder.mkdir()
     for shared in ("docs", "checkpoints"):
         (folder / shared).symlink_to(ROOT / shared)
-    run(runnable(ROOT / "README.md"), folder)
     return folder
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if runnable(page) or list(blocks(page))], ids=name)
 def test_the_page_runs(page: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    done = readme_folder(tmp_path_factory.getbasetemp())
-    if page.name == "README.md":
-        return
-    folder, text = tmp_path_factory.mktemp("page"), page.read_text(encoding="utf-8")
-    lines = runnable(page)
+    done = trained(tmp_path_factory.getbasetemp())
+    folder, text = new_folder(tmp_path_factory.mktemp("page") / "of"), page.read_text(encoding="utf-8")
+    known = set() if page == TRAINING else {line.tokens for line in runnable(TRAINING)}
+    lines = [line for line in runnable(page) if line.tokens not in known]
     made_here = {option for line in lines for option in line.options}
     for made in MADE:
-        if made in text and f"output={made}" not in made_here:
+        if (made in text or page.name == "README.md") and f"output={made}" not in made_here:
             shutil.copytree(done / made, folder / made)
-    for shared in ("docs", "checkpoints"):
-        (folder / shared).symlink_to(ROOT / shared)
     scripts = write_files(page, folder)
     if lines:
         run(lines, folder)
