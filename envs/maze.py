@@ -49,8 +49,7 @@ class Maze(World):
         maximum_steps: after how many steps an episode is truncated; published, 80.
         margin: the part of 0.45 m within which a plan has to end.
 
-    Raises:
-        ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
+    Raises ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}

@@ -212,8 +212,7 @@ class Goal(ABC):
 def check_world(world: World) -> None:
     """Begin an episode, make a step, and check what the world says of them.
 
-    Raises:
-        ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
+    Raises ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
     """
     name, space = type(world).__name__, world.space
     box = world.action_space

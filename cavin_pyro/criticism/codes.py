@@ -28,8 +28,7 @@ def log_weights(
     Args:
         fixed: values of codes `[K, B, D]` that are not sampled. Their densities stay in the weight.
 
-    Returns:
-        `[K, B]`, float64.
+    Returns `[K, B]`, float64.
     """
     pieces = []
     step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))

@@ -168,9 +168,8 @@ def sample_sites(
 def score(prediction: Prediction, ranks: Tensor, episodes: Tensor) -> dict[str, Any]:
     """How well a prediction whose truth has `ranks: [B, ...]` holds, for windows of `episodes: [B]`.
 
-    Returns:
-        Intervals of the coverage by level, `"50"` and `"90"`; `stated`: root of the mean variance of the samples;
-        `error`: root of the mean squared error of their mean.
+    Returns intervals of the coverage by level, `"50"` and `"90"`; `stated`: root of the mean variance of the samples;
+    `error`: root of the mean squared error of their mean.
     """
     samples, real, counted = prediction
     count = counted.double().flatten(1).sum(1)

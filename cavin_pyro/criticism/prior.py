@@ -175,8 +175,7 @@ def held_out_logits(first: Tensor, second: Tensor, episodes: Tensor, seed: int) 
     Args:
         episodes: of the pairs `[N]`, at least two.
 
-    Returns:
-        `[N]` each.
+    Returns `[N]` each.
     """
     names, which = torch.unique(episodes, return_inverse=True)
     folds = min(FOLDS, len(names))

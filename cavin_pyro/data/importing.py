@@ -32,12 +32,9 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
     Args:
         env: the world as in the option `env`, by a name of ours or its class, and options: ["my.World", "size=3"].
 
-    Returns:
-        The metadata of the new dataset, with Minari's name and a SHA-256 of what was read.
-
-    Raises:
-        UserError: Minari is not installed, it has no such dataset, a world that cannot be built or that cannot read an
-            observation, actions out of its box, numbers that are not finite, or `target` holds a dataset.
+    Returns the metadata of the new dataset, with Minari's name and a SHA-256 of what was read. Raises UserError: Minari
+    is not installed, it has no such dataset, a world that cannot be built or that cannot read an observation, actions
+    out of its box, numbers that are not finite, or `target` holds a dataset.
     """
     try:
         import minari

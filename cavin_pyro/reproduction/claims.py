@@ -39,9 +39,8 @@ def claims(rates: pd.DataFrame, tests: pd.DataFrame, *, planner: str, criterion:
     Args:
         rates: `cavin_pyro.reproduction.table.rates`. tests: `paired_tests`.
 
-    Returns:
-        For each its `claim`, what stands in the paper, what was measured `here`, and whether it `holds`: "yes" or "no",
-        with ", within chance" where the interval includes the opposite; empty for figures alone.
+    Returns for each its `claim`, what stands in the paper, what was measured `here`, and whether it `holds`: "yes" or
+    "no", with ", within chance" where the interval includes the opposite; empty for figures alone.
     """
     place = ["method", "task", "reward", "objects"]
     own, compared = (

@@ -40,8 +40,7 @@ class Objective:
         rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
             each step already, so a weight trades its density for the accuracy of rollouts.
 
-    Raises:
-        ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
+    Raises ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
     """
 
     def __init__(

@@ -106,8 +106,7 @@ def single_target(world: World) -> bool:
 def candidate_subgoals(record: PlanRecord, objects: list[int], *, count: int = CANDIDATES) -> tuple[Floats, Floats]:
     """Some of the candidate subgoals of some objects.
 
-    Returns:
-        Positions [n, P] and returns [n] of their plans with n at most `count`, best last.
+    Returns positions [n, P] and returns [n] of their plans with n at most `count`, best last.
     """
     centers, returns = (part[0].numpy() for part in (record.plan.candidate_centers, record.plan.candidate_returns))
     points = centers[:, :, [index for index in objects if index < centers.shape[2]]]  # [N, K, objects, P]

@@ -161,8 +161,7 @@ class PushingEnv(Uncopied, World):
         Args:
             options: `layout`, the number of one of the environment's `tasks`, instead of a random one.
 
-        Raises:
-            ValueError: the layout has no room for the objects, or there is no layout of that number.
+        Raises ValueError: the layout has no room for the objects, or there is no layout of that number.
         """
         super().reset(seed=seed)
         (scene_generator,) = self.np_random.spawn(1)
@@ -186,9 +185,7 @@ class PushingEnv(Uncopied, World):
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Push, wait until the objects rest, observe them, and compute the reward.
 
-        Raises:
-            ValueError: the action is not four finite numbers.
-            RuntimeError: called before `reset`.
+        Raises ValueError: the action is not four finite numbers. RuntimeError: called before `reset`.
         """
         if self._observation is None:
             raise RuntimeError("call reset() before step()")
@@ -310,8 +307,7 @@ def state_of(observation: Mapping[str, NDArray[Any]], geometry: Geometry) -> Sta
     Args:
         observation: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. geometry: on the CPU.
 
-    Raises:
-        ValueError: no object, or numbers of one that are not finite.
+    Raises ValueError: no object, or numbers of one that are not finite.
     """
     real = np.flatnonzero(observation["mask"])
     for name in ("clouds", "centers"):

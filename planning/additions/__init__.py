@@ -48,9 +48,8 @@ def make_additions(additions: Sequence[str | Addition], hooks: Sequence[str]) ->
     Args:
         hooks: which the planner calls.
 
-    Raises:
-        ValueError: an unknown name, an object that is no addition, one that is given twice, or one without a hook that
-            the planner calls.
+    Raises ValueError: an unknown name, an object that is no addition, one that is given twice, or one without a hook
+    that the planner calls.
     """
     made = []
     for addition in additions:

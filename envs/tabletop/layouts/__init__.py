@@ -29,8 +29,7 @@ _FOLDER = Path(__file__).parent
 def task_class(task: str | type[Task]) -> type[Task]:
     """The class of a task, by its name; a class is returned unchanged.
 
-    Raises:
-        ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
+    Raises ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
     """
     if isinstance(task, str):
         check_choice("task", task, TASKS)
@@ -62,8 +61,7 @@ def possible_tasks(
         task, layout, tiles: as in `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
             in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`.
 
-    Raises:
-        ValueError: as `load_task`, or tiles for `layout=random`.
+    Raises ValueError: as `load_task`, or tiles for `layout=random`.
     """
     if layout != RANDOM:
         return (load_task(task, layout, tiles),)
@@ -86,8 +84,7 @@ def generate_task(
     Args:
         generator: None generates that of seed 0. tiles: fields that are no lists of tiles, as in `possible_tasks`.
 
-    Raises:
-        ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
+    Raises ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
     """
     options = _options(task, GENERATED, tiles)
     generated = task_class(task).generate(wanted, generator or np.random.default_rng(0))
@@ -111,9 +108,8 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
         task: a name in `TASKS`, or a class. layout: a number, or the path of a YAML file.
         tiles: fields that replace those of the layout; None values are ignored.
 
-    Raises:
-        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, tiles that contradict the
-            task, or a start from which no pushes lead to the goal.
+    Raises ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, tiles that contradict
+    the task, or a start from which no pushes lead to the goal.
     """
     kind = task_class(task)
     path = _path(kind, layout)
@@ -137,8 +133,7 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
 def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
     """A task in the layout that `content`, lists of tiles by field, describes.
 
-    Raises:
-        ValueError: a key is unknown or missing, or tiles contradict the task.
+    Raises ValueError: a key is unknown or missing, or tiles contradict the task.
     """
     kind = task_class(task)
     keys = kind.layout_keys()

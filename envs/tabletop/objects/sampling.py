@@ -69,8 +69,7 @@ WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] -
 def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Generator) -> NDArray[np.float64]:
     """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
 
-    Raises:
-        NoRoomError: no arrangement was found.
+    Raises NoRoomError: no arrangement was found.
     """
     for _ in range(ATTEMPTS):
         chosen: list[NDArray[np.float64]] = []
@@ -99,8 +98,7 @@ def sample_objects(
     Args:
         areas: start area of each object; the first is the target. objects: the set of the names.
 
-    Raises:
-        NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
+    Raises NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
     """
     names = chosen(ranges.names, objects)
     targets = chosen(ranges.target, objects) or names

@@ -49,8 +49,7 @@ class ArmDescription:
 class LoadedArm:
     """An arm's body in a simulation, and PyBullet's numbers of its parts.
 
-    Raises:
-        ValueError: PyBullet cannot read the file, or it lacks a joint or link of the description.
+    Raises ValueError: PyBullet cannot read the file, or it lacks a joint or link of the description.
     """
 
     def __init__(self, client: BulletClient, description: ArmDescription) -> None:

@@ -97,8 +97,7 @@ def push(robot: Robot, start: NDArray[np.float64], end: NDArray[np.float64]) -> 
     Args:
         start, end: [2] metres, where the tip touches down and where it leaves the table.
 
-    Returns:
-        Why the push ended early, "" if it did not. An unsafe or unreachable push is not begun.
+    Returns why the push ended early, "" if it did not. An unsafe or unreachable push is not begun.
     """
     low, above, last = np.append(start, TIP_HEIGHT), np.append(start, ABOVE_HEIGHT), np.append(end, TIP_HEIGHT)
     if not robot.fits(low):

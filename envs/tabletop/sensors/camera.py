@@ -78,8 +78,7 @@ class Camera:
         Args:
             depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
 
-        Returns:
-            [P, 3] metres.
+        Returns [P, 3] metres.
         """
         return np.array(self.position) + (self.rays(rows, columns) * depth[rows, columns][:, None]) @ self.axes
 
@@ -93,8 +92,7 @@ class Camera:
 def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """Sample `count` of the points [P, 3], each as often as any other or once more.
 
-    Raises:
-        ValueError: there is no point to sample from.
+    Raises ValueError: there is no point to sample from.
     """
     if len(points) == 0:
         raise ValueError("no point to sample a cloud from: the object is not visible")

@@ -92,8 +92,7 @@ class TaskReward:
             those of the published implementation for real episodes (`Task.published_violation`).
         device: where the layout's numbers lie, best that of the tensors to evaluate.
 
-    Raises:
-        ValueError: unknown kind of reward, unknown criterion, or a negative margin.
+    Raises ValueError: unknown kind of reward, unknown criterion, or a negative margin.
     """
 
     reads_features = False

@@ -134,8 +134,7 @@ class Task(ABC):
         movable: the field with the goal's tiles, which a person may move during an episode; "": none.
         target_start, obstacle_start: tiles on which objects start.
 
-    Raises:
-        ValueError: a tile is malformed, listed twice or off the table, or tiles contradict one another.
+    Raises ValueError: a tile is malformed, listed twice or off the table, or tiles contradict one another.
     """
 
     name: ClassVar[str]
@@ -235,8 +234,7 @@ class Task(ABC):
     def moved(self: Self, goals: NDArray[np.float64], target: Place) -> Self:
         """This task with its goal moved during an episode, by whole tiles; `target`: where the target is.
 
-        Raises:
-            ValueError: tiles would be off the table, or contradict others.
+        Raises ValueError: tiles would be off the table, or contradict others.
         """
         if not self.movable:
             raise ValueError(f"the goal of {self.name} cannot be moved")
@@ -263,8 +261,7 @@ class Task(ABC):
     def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
         """The task in a new layout as `wanted`, for `layout=generated`; by default there are none.
 
-        Raises:
-            ValueError: there is no such layout.
+        Raises ValueError: there is no such layout.
         """
         raise ValueError(f"task {cls.name} has no generated layouts: give another layout, or another task")
 
@@ -307,8 +304,7 @@ def check_inside(inner: Iterable[Tile], outer: Iterable[Tile], problem: str) -> 
 def check_functions(task: Task, objects: int) -> None:
     """Call the functions of a task once, on a few plans with that number of objects.
 
-    Raises:
-        ValueError: one returns another type or shape than `Task` documents.
+    Raises ValueError: one returns another type or shape than `Task` documents.
     """
     plans, steps = 8, 6  # other than one another and than any number of objects: no wrong shape fits by chance
     states, mask = torch.zeros(plans, steps + 1, objects, 2), torch.ones(plans, 1, objects, dtype=torch.bool)

@@ -162,8 +162,8 @@ def box_distance(points: Tensor, lows: Sequence[float], highs: Sequence[float]) 
 def parse_tiles(value: Any, name: str) -> tuple[Tile, ...]:
     """Check a list of tiles from Python or YAML.
 
-    Raises:
-        ValueError: it is no list, or a tile is malformed, listed twice or off the table; `name` says which list it is.
+    Raises ValueError: it is no list, or a tile is malformed, listed twice or off the table; `name` says which list it
+    is.
     """
     if isinstance(value, TileSet):
         value = value.tiles

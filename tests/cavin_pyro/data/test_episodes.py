@@ -98,7 +98,7 @@ def test_the_command_collects_in_a_world_with_options(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["env.wild=1.5"], r"^actions has numbers as large as 1\.5, out of the box from -1 to 1"),
+        (["env.wild=1.5"], r"^episode 0 of seed=0: actions has numbers as large as 1\.5, out of the box from -1 to 1"),
         (["env.flaw=nan"], "centers must be finite float32 numbers"),
         (["maximum_objects=3"], "^maximum_objects=3 is of the tabletop"),
     ],
