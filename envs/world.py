@@ -47,7 +47,6 @@ class RandomBursts:
         self._generator, self._action = generator, generator.uniform(-1.0, 1.0, size)
 
     def act(self, observation: Any) -> NDArray[np.float64]:
-        """See `Policy`."""
         if self._generator.random() < 0.25:
             self._action = self._generator.uniform(-1.3, 1.3, self._action.shape).clip(-1.0, 1.0)
         return self._action

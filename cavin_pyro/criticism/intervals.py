@@ -55,9 +55,7 @@ EXPLANATION = (
 def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int = 200) -> Section:
     """Coverage of central intervals of f, h and g, and their scales beside their errors.
 
-    Args:
-        windows: held-out windows, at most.
-        samples: samples of each prediction.
+    `windows`: held-out windows, at most. `samples`: samples of each prediction.
     """
     (window, episodes), space = context.held_out(windows), context.space
     with seeded(context.seed):

@@ -158,8 +158,7 @@ def subgoal_rollouts(
 ) -> Iterator[list[SubgoalRollout]]:
     """In each scene, one rollout per way to obtain a motion; scene k depends on the seed and k alone.
 
-    Args:
-        samples: N, the number of candidates for the closest motion.
+    `samples`: N, the number of candidates for the closest motion.
     """
     assert context.world is not None
     with closing(context.world if isinstance(context.world, World) else open_scene(context.world)) as simulator:
@@ -176,10 +175,8 @@ def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, obj
 def execute(world: World, actions: Floats, *, to_the_end: bool = False) -> tuple[Floats, bool]:
     """Carry out actions [T, A] from the present state of a world.
 
-    Args:
-        to_the_end: go on where the episode ends.
-
-    Returns positions [n, M, P] after each action, with n less than T if the episode ended on the way; whether it ended.
+    `to_the_end`: go on where the episode ends. Returns positions [n, M, P] after each action, with n less than T if the
+    episode ended on the way; whether it ended.
     """
     path, over = [], False
     for action in actions:

@@ -98,11 +98,8 @@ def collect(
     order by this process alone: the metadata count a shard only once its file is in place. A killed run therefore
     resumes after the last shard that counts.
 
-    Args:
-        workers: processes.
-
-    Returns the dataset's metadata. Raises UserError: the folder holds a dataset of another configuration. WorkerError:
-    a worker was killed.
+    `workers`: processes. Returns the dataset's metadata. Raises UserError: the folder holds a dataset of another
+    configuration. WorkerError: a worker was killed.
     """
     metadata = _begin(config, folder)
     damaged = [number for number in range(metadata["shards"]) if not _is_whole(folder, number, metadata)]

@@ -127,10 +127,8 @@ def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapping[str, Any] | None = None) -> Arrays:
     """Read one shard, or some of its arrays; types, shapes and ranges are checked.
 
-    Args:
-        metadata: of the dataset, with which the numbers of episodes, pushes and objects must agree.
-
-    Raises UserError: the file is missing, truncated, damaged or not a shard; it is named.
+    `metadata`: of the dataset, with which the numbers of episodes, pushes and objects must agree. Raises UserError: the
+    file is missing, truncated, damaged or not a shard; it is named.
     """
     metadata = metadata or {}
     configuration, arrays, where = metadata.get("configuration", {}), Arrays(), ""
@@ -169,11 +167,8 @@ def _check_agreement(arrays: Arrays, metadata: Mapping[str, Any]) -> None:
 def check_file(file: h5py.File, configuration: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
     """Check types and shapes of all declared arrays of a file, before any is read.
 
-    Args:
-        configuration: of the collection, which tells E, S and M, and of a world P, F and A. What it lacks, the arrays
-            must agree on.
-
-    Raises ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
+    `configuration`: of the collection, which tells E, S and M, and of a world P, F and A. What it lacks, the arrays
+    must agree on. Raises ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
     """
     options = {"E": "episodes_per_shard", "S": "steps", "M": "maximum_objects"}
     if space := space_of({"configuration": configuration}):

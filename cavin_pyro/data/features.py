@@ -55,10 +55,7 @@ def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[
 def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: str) -> NDArray[np.float32]:
     """Features [E, S+1, M, 64] of one shard, read from beside it if the same `geometry` made them of it before.
 
-    Args:
-        fingerprint: see `geometry_fingerprint`.
-
-    Raises UserError: the shard is corrupt.
+    `fingerprint`: see `geometry_fingerprint`. Raises UserError: the shard is corrupt.
     """
     shard, metadata = dataset.shard_path(folder, number), dataset.read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name
@@ -99,10 +96,8 @@ def sample_clouds(
 ) -> NDArray[np.float32]:
     """Sample clouds [count, 256, 3] metres from datasets, from as many shards as it takes, real objects only.
 
-    Args:
-        held_out_objects: names of objects whose clouds are omitted.
-
-    Raises UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
+    `held_out_objects`: names of objects whose clouds are omitted. Raises UserError: no dataset, a corrupt shard, an
+    object that no dataset knows, or too few clouds are left.
     """
     dataset.check_tabletop(folders, "there are no clouds in it")
     excluded = find_held_out(held_out_objects, folders, option="held_out_objects")

@@ -252,8 +252,7 @@ class Trainer:
 def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
     """Mirror some of the windows `[B]` in the plane y = 0, for worlds that are symmetric about it.
 
-    Args:
-        which: `[B]` bool. signs: `[F]`, of features, see `Geometry.mirror_signs`.
+    `which`: `[B]` bool. `signs`: `[F]`, of features, see `Geometry.mirror_signs`.
     """
     flip = 1.0 - 2.0 * which.to(window.actions.dtype)[:, None]  # [B, 1]
     same = torch.ones_like(flip)

@@ -191,9 +191,8 @@ def trail(episode: Episode, count: int) -> Floats:
 def draw_episode(path: Path, episode: Episode, world: World) -> None:
     """Draw at most three plans, evenly spread and in temporal order, and the end, without what a planner lacks.
 
-    Args:
-        episode: its plans hold pictures, if the world has any.
-        world: in which it ended; its goal is still the episode's.
+    `episode`: its plans hold pictures, if the world has any. `world`: in which it ended; its goal is still the
+    episode's.
     """
     count = len(episode.plan_records)
     chosen = [episode.plan_records[i] for i in np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)]

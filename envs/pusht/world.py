@@ -237,16 +237,13 @@ class PushT(World):
         self.pose = np.array([*disc.clip(WALLS[0] + RADIUS, WALLS[1] - RADIUS), *block])
 
     def policy(self, generator: np.random.Generator) -> PushTPolicy:
-        """See `World`."""
         return PushTPolicy(generator)
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
-        """See `World`."""
         return np.asarray(centers, dtype=np.float64) * (PICTURE / SIZE)
 
     @property
     def landmarks(self) -> dict[str, NDArray[np.floating]]:
-        """See `World`."""
         return {"goal": self.pose[2:4]}
 
     def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -268,7 +265,6 @@ class PushT(World):
         return np.array(self._simulator.render())
 
     def close(self) -> None:
-        """Free the simulator."""
         self._simulator.close()
 
     def _is_success(self) -> bool:

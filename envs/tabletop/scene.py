@@ -112,11 +112,8 @@ class Scene(Uncopied):
     ) -> Observation:
         """Sample scenes until one settles with every object on the table, in view and acceptable.
 
-        Args:
-            areas: start area of each object; the first is the target.
-            generator: the scene's stream, from which those of objects and points derive (`cavin_pyro.envs.randomness`).
-
-        Raises NoRoomError: no such scene was found.
+        `areas`: start area of each object; the first is the target. `generator`: the scene's stream, from which those
+        of objects and points derive (`cavin_pyro.envs.randomness`). Raises NoRoomError: no such scene was found.
         """
         for _ in range(SCENE_SAMPLES):
             scene_generator, point_generator = generator.spawn(2)

@@ -76,7 +76,6 @@ class NamedObjects:
         self.makers, self.names = makers, tuple(makers)
 
     def asset(self, name: str) -> ObjectAsset:
-        """See `ObjectSet`."""
         if name not in self.makers:
             raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
         return self.makers[name](name)

@@ -95,10 +95,8 @@ def sample_objects(
 ) -> list[ObjectParameters]:
     """Sample one object per area, in random orientation, above the table and clear of its neighbours.
 
-    Args:
-        areas: start area of each object; the first is the target. objects: the set of the names.
-
-    Raises NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
+    `areas`: start area of each object; the first is the target. `objects`: the set of the names. Raises NoRoomError:
+    the areas are too small for so many objects. ValueError: an unknown name.
     """
     names = chosen(ranges.names, objects)
     targets = chosen(ranges.target, objects) or names

@@ -62,8 +62,7 @@ class Camera:
     def rays(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
         """Rays of pixels, in the image's axes: [P, 3] (right, down, 1), metres at a distance of one metre.
 
-        Args:
-            rows, columns: [P] pixel indices.
+        `rows`, `columns`: [P] pixel indices.
         """
         along_row, along_column, column, row = self.intrinsics
         right = (columns + RAY_COLUMN - column) / along_row
@@ -75,10 +74,8 @@ class Camera:
     ) -> NDArray[np.float64]:
         """Points in the robot's base frame at chosen pixels.
 
-        Args:
-            depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
-
-        Returns [P, 3] metres.
+        `depth`: [height, width] metres along the optical axis. `rows`, `columns`: [P] pixel indices. Returns [P, 3]
+        metres.
         """
         return np.array(self.position) + (self.rays(rows, columns) * depth[rows, columns][:, None]) @ self.axes
 

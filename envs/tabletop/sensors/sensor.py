@@ -44,7 +44,6 @@ class Renderer(Protocol):
 
     def __call__(self, camera: Camera, *, table: bool = True) -> Rendering:
         """Render the view of `camera`, with or without the table."""
-        ...
 
 
 @runtime_checkable
@@ -54,15 +53,12 @@ class DepthSensor(Protocol):
     @property
     def nominal(self) -> Camera:
         """The nominal camera, in whose view no robot may stand."""
-        ...
 
     def reset(self, generator: np.random.Generator) -> None:
         """Begin an episode, whose noise is all sampled from `generator`."""
-        ...
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image; also returns the simulator's body numbers [height, width], which no real sensor has."""
-        ...
 
 
 class IdealSensor:

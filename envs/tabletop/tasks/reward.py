@@ -128,9 +128,8 @@ class TaskReward:
     def along(self, states: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
         """Evaluate all T steps of paths, equal to one call per step, but faster: [..., T].
 
-        Args:
-            states: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target.
-            mask: [..., M] bool, True for real objects. fallen: as for one step.
+        `states`: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target. `mask`:
+        [..., M] bool, True for real objects. `fallen`: as for one step.
         """
         step = Step(states[..., :2], mask.unsqueeze(-2), self.margin)
         fall = step.any_enters(lambda points: -table_distance(points))

@@ -77,8 +77,7 @@ class Step(NamedTuple):
 
         By more than `STILL`: predictions of an object that nothing touches differ by less. What lies there may stay.
 
-        Args:
-            arrived: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
+        `arrived`: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
         """
         depths = torch.where(arrived(self.states), -torch.inf, -box_distance(self.states, REACH_LOW, REACH_HIGH))
         before, after = depths[..., :-1, :], depths[..., 1:, :]
@@ -195,15 +194,13 @@ class Task(ABC):
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the remaining distance in metres: [...]; its increase over a step is the dense reward's `progress`.
 
-        Args:
-            positions: [..., M, 2] metres. mask: [..., M] bool, True for real objects.
+        `positions`: [..., M, 2] metres. `mask`: [..., M] bool, True for real objects.
         """
 
     def terms(self, step: Step, success: Tensor, failure: Tensor, *, dense: bool) -> dict[str, Tensor]:
         """The reward's terms by name, each [...]; the reward is their sum.
 
-        Args:
-            success, failure: [...] bool, at most one of them true.
+        `success`, `failure`: [...] bool, at most one of them true.
         """
         progress = torch.zeros_like(step.target[..., 0])
         if dense:
@@ -221,8 +218,7 @@ class Task(ABC):
         The environment calls it with every scene that may become an episode, and the planner's reward is that of the
         returned task.
 
-        Args:
-            observation: the episode's first. generator: for the goal alone, so that scenes do not depend on the task.
+        `observation`: the episode's first. `generator`: for the goal alone, so that scenes do not depend on the task.
         """
         return self
 

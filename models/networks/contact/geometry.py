@@ -63,9 +63,8 @@ class ToolContact(nn.Module):
 
         Components come first, so that loops run over candidates.
 
-        Args:
-            along, across: `[...]` metres, the object's centre from the push's start.
-            outline: `[2 K + 1, ...]`, in the push's frame. length: metres, of the push; broadcasts to `[...]`.
+        `along`, `across`: `[...]` metres, the object's centre from the push's start. `outline`: `[2 K + 1, ...]`, in
+        the push's frame. `length`: metres, of the push; broadcasts to `[...]`.
 
         Returns `[MEASURES, ...]`: the way until the tool enters; the chord that it would cut, negative if it passes
         beside; the way that is left then, and the same if it hits at all; the normal of the side that it meets (x, y)
@@ -150,9 +149,8 @@ def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, marg
     An object that the tool meets is taken for a disc that is carried along the push for the rest of its way. Objects
     that such objects push are not asked what they push.
 
-    Args:
-        along, across: `[M, ...]` metres, centres from the push's start, in its axes. length: `[...]` metres, of the
-            push; broadcasts to `[M, ...]`. radius: `[M, ...]` metres, mean extent of the objects. margin: metres.
+    `along`, `across`: `[M, ...]` metres, centres from the push's start, in its axes. `length`: `[...]` metres, of the
+    push; broadcasts to `[M, ...]`. `radius`: `[M, ...]` metres, mean extent of the objects. `margin`: metres.
     """
     met = _squared_distance(along, across, length) < (radius + (TOOL_RADIUS + margin)).square()
     if len(along) == 1:
