@@ -156,8 +156,7 @@ class Goal(ABC):
 
     reward = 100 at success, -100 at failure, -1 each step, and `weight` times the decrease of `distance`
 
-    Args:
-        space: of the world. weight: of progress; 0 is a sparse reward.
+    `space`: of the world. `weight`: of progress; 0 is a sparse reward.
     """
 
     reads_features = True

@@ -52,9 +52,8 @@ Row = dict[str, float]
 class Trainer:
     """Trains one model and guide on windows, all on their device.
 
-    Args:
-        objective: what is minimised. folder: where metrics and the resume file go. seed: of batches and codes.
-        save: called with the step and the metrics whenever the validation loss is the best so far.
+    `objective`: what is minimised. `folder`: where metrics and the resume file go. `seed`: of batches and codes.
+    `save`: called with the step and the metrics whenever the validation loss is the best so far.
     """
 
     def __init__(
@@ -204,10 +203,7 @@ class Trainer:
             writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
             writer.writeheader()
             writer.writerows(self.rows)
-        tensors: dict[str, Tensor] = {
-            **random_states(self.windows.device),
-            "batches": self._batches.get_state(),
-        }
+        tensors = random_states(self.windows.device) | {"batches": self._batches.get_state()}
         tensors |= self._programs.state_dict()
         write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {"rows": self.rows})
 

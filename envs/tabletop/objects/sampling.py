@@ -47,9 +47,8 @@ class ObjectRanges:
 class ObjectParameters:
     """One sampled object: its shape and parameters, and the pose from which it is dropped.
 
-    Attributes:
-        name: in its set. scale: factor. mass: kilograms. friction: coefficient.
-        position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
+    `name`: in its set. `scale`: factor. `mass`: kilograms. `friction`: coefficient. `position`: (x, y, z) metres.
+    `orientation`: unit quaternion (x, y, z, w).
     """
 
     name: str

@@ -37,8 +37,7 @@ ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
 class Poses:
     """True poses of bodies.
 
-    Attributes:
-        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
+    `positions`: [M, 3] metres. `orientations`: [M, 4] unit quaternions (x, y, z, w).
     """
 
     positions: NDArray[np.float64]

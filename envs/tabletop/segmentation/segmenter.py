@@ -39,8 +39,7 @@ TrueMasks = Callable[[], Sequence[NDArray[np.bool_]]]
 class MaskSegmenter:
     """The true mask of each object, restricted to pixels with a measurement.
 
-    Args:
-        true_masks: called once per image.
+    `true_masks`: called once per image.
     """
 
     def __init__(self, true_masks: TrueMasks) -> None:

@@ -15,9 +15,8 @@ from cavin_pyro.envs.tabletop.sensors.camera import Camera
 class DepthImage:
     """The image of a depth camera, simulated or real.
 
-    Attributes:
-        depth: [height, width] metres along the optical axis; 0 where there is no measurement.
-        camera: the assumed camera.
+    `depth`: [height, width] metres along the optical axis; 0 where there is no measurement. `camera`: the assumed
+    camera.
     """
 
     depth: NDArray[np.floating]
@@ -62,11 +61,7 @@ class DepthSensor(Protocol):
 
 
 class IdealSensor:
-    """A camera at its nominal pose, without errors.
-
-    Args:
-        camera: its pose and resolution.
-    """
+    """A camera at its nominal pose, without errors; `camera`: its pose and resolution."""
 
     def __init__(self, camera: Camera | None = None) -> None:
         self.nominal = camera or Camera()

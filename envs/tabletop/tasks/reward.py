@@ -26,9 +26,8 @@ CRITERIA = ("strict", "published")
 class Outcome(NamedTuple):
     """The outcome of one step of a task; every tensor is [...].
 
-    Attributes:
-        reward: the sum of the terms. terms: by name, see `Task.terms`.
-        success, violation, fall: bool, at most one is true.
+    `reward`: the sum of the terms. `terms`: by name, see `Task.terms`. `success`, `violation`, `fall`: bool, at most
+    one is true.
     """
 
     reward: Tensor

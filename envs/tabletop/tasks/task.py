@@ -37,9 +37,8 @@ class Step(NamedTuple):
     A task evaluates all T steps at once: [..., T]. The environment evaluates T = 1 step at a time, planners whole
     segments, so that no state is evaluated twice.
 
-    Attributes:
-        states: [..., T + 1, M, 2] metres. mask: [..., 1, M] bool, True for real objects.
-        margin: safety margin in metres, for planners; else 0.
+    `states`: [..., T + 1, M, 2] metres. `mask`: [..., 1, M] bool, True for real objects. `margin`: safety margin in
+    metres, for planners; else 0.
     """
 
     states: Tensor

@@ -87,14 +87,6 @@ def test_an_episode_has_the_motions_of_its_actions_and_ends_where_the_world_ends
     assert len([*iterate_shards(walks, tuple(WORLD_ARRAYS))]) == read_metadata(walks)["shards"]  # each of them whole
 
 
-def test_the_command_collects_in_a_world_with_options(tmp_path: Path) -> None:
-    config = compose("collect", f"env._target_={POINT['_target_']}", "env.stops=false", "steps=4", f"output={tmp_path}")
-    collection = _collection(config)
-    metadata = collect(collection, tmp_path, transitions=200, workers=1)
-    assert metadata["configuration"]["world"] == {**POINT, "stops": False}
-    assert metadata["episodes"] == 50
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
