@@ -34,7 +34,8 @@ class AutomaticGuide(Guide):
         Args:
             autoguide: a class of `pyro.infer.autoguide`, or one of your own that takes the model.
 
-        Raises ValueError: an incompatible model, or a class that is no module.
+        Raises:
+            ValueError: an incompatible model, or a class that is no module.
         """
         super().__init__(model)
         with pyro.settings.context(module_local_params=True):  # which Pyro's modules must know when they are made

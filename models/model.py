@@ -90,7 +90,8 @@ class Model(Program):
             scales: of the likelihoods; by default the space's, `LikelihoodScales`.
             dynamics: f; by default the paper's, `Dynamics`.
 
-        Raises ValueError: a number out of range, or scales that f must predict if it does not.
+        Raises:
+            ValueError: a number out of range, or scales that f must predict if it does not.
         """
         super().__init__()
         self._encoding: tuple[Window, Tensor] | None = None

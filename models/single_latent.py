@@ -49,7 +49,8 @@ class SingleLatentModel(Model):
                 actions by sqrt(w). The objective is a bound on the evidence only with 1.
             shared: the arguments of `Model`.
 
-        Raises ValueError: an `action_weight` that is not a positive number.
+        Raises:
+            ValueError: an `action_weight` that is not a positive number.
         """
         check_number("action_weight", action_weight, positive=True)
         super().__init__(**shared)

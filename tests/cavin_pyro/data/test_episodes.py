@@ -177,7 +177,6 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
         ({"features": [*given["features"][:9], given["features"][9].repeat(2, 2)]}, "^episode 9: features has shape"),
         ({"mask": [[False]] * 10}, "^episode 0: mask has a state without an object"),
         ({"mask": [[np.nan]] * 10}, "^episode 0: mask has float64 numbers, which are no bool$"),
-        ({"features": [None] * 10}, "^episode 0: features must be an array of numbers: "),
         ({"actions": [[[0.0], [0.0, 0.0]]] * 10}, "^episode 0: actions must be an array of numbers: "),
         ({"actions": [np.zeros((0, 2))] * 10}, r"must have \[any, 2\], none of them 0$"),
         ({"validation_fraction": 1}, "^validation_fraction must be a number above 0 and at most 0.99, not 1$"),
