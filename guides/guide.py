@@ -14,7 +14,9 @@ class Guide(Program):
     A guide's `forward(window)` has a `pyro.sample` for every code of the model and no others. It reads the same state
     features as the model, `model.encode(window)`, which training computes once for both.
 
-    `model`: whose codes the guide infers, and whose other dimensions it has. `width`: width of the guide's own layers.
+    Args:
+        model: whose codes the guide infers, and whose other dimensions it has.
+        width: width of the guide's own layers.
     """
 
     fits: ClassVar[tuple[str, ...]] = ()
