@@ -34,7 +34,7 @@ def _list() -> None:
         return
     print(f"cavin_pyro {__version__}: the CAVIN planner as modular probabilistic programs\n")
     for name in ORDER:
-        print(f"  python -m cavin_pyro.{name:<10}{purpose(name)}")
+        print(f"  python -m cavin_pyro.{name:<12}{purpose(name)}")
     print("\n`python -m cavin_pyro.COMMAND --help` lists a command's options, with examples.")
 
 

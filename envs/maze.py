@@ -49,8 +49,7 @@ class Maze(World):
         maximum_steps: after how many steps an episode is truncated; published, 80.
         margin: the part of 0.45 m within which a plan has to end.
 
-    Raises:
-        ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
+    Raises ImportError: gymnasium-robotics is not installed. ValueError: an argument is not one of those above.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
@@ -109,26 +108,21 @@ class Maze(World):
         return seen, float(success), success, not success and self._steps >= self.maximum_steps, {"success": success}
 
     def state(self, observation: NDArray[np.float64]) -> State:
-        """See `World`."""
         place, velocity = torch.tensor(observation, dtype=torch.float32).split(2)
         return State(place[None], velocity[None], torch.ones(1, dtype=torch.bool))
 
     def goal(self, device: str | torch.device = "cpu") -> Place:
-        """See `World`."""
         return Place(self.space, self.place, self._radius)
 
     def policy(self, generator: np.random.Generator) -> Wanderer:
-        """See `World`."""
         return Wanderer(generator, self.ways, self._simulator.maze)
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
-        """See `World`."""
         maze = self._simulator.maze
         return PIXELS * (np.asarray(centers) * (1, -1) + (maze.x_map_center, maze.y_map_center))
 
     @property
     def landmarks(self) -> dict[str, NDArray[np.floating]]:
-        """See `World`."""
         return {"goal": self.place}
 
     def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -148,7 +142,6 @@ class Maze(World):
         return picture
 
     def close(self) -> None:
-        """Free the simulator."""
         self._simulator.close()
 
 

@@ -47,7 +47,6 @@ class RandomBursts:
         self._generator, self._action = generator, generator.uniform(-1.0, 1.0, size)
 
     def act(self, observation: Any) -> NDArray[np.float64]:
-        """See `Policy`."""
         if self._generator.random() < 0.25:
             self._action = self._generator.uniform(-1.3, 1.3, self._action.shape).clip(-1.0, 1.0)
         return self._action
@@ -157,8 +156,7 @@ class Goal(ABC):
 
     reward = 100 at success, -100 at failure, -1 each step, and `weight` times the decrease of `distance`
 
-    Args:
-        space: of the world. weight: of progress; 0 is a sparse reward.
+    `space`: of the world. `weight`: of progress; 0 is a sparse reward.
     """
 
     reads_features = True
@@ -212,8 +210,7 @@ class Goal(ABC):
 def check_world(world: World) -> None:
     """Begin an episode, make a step, and check what the world says of them.
 
-    Raises:
-        ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
+    Raises ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
     """
     name, space = type(world).__name__, world.space
     box = world.action_space

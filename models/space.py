@@ -41,8 +41,7 @@ class Space:
             and the sine of its angle. The first two numbers of positions, features and each part of actions turn.
         frequencies: of sines and cosines of positions that networks also read, of wavelengths 2, 1, 1/2 ... lengths.
 
-    Raises:
-        ValueError: a number out of range, or parts of different number.
+    Raises ValueError: a number out of range, or parts of different number.
     """
 
     origin: Sequence[float]

@@ -120,9 +120,8 @@ class SearchingPlanner(ABC):
             observed: what else the world shows, for additions: a named tuple of tensors `[B, ...]`.
             steps_left: in the episodes, for `shrinking_horizon`.
 
-        Raises:
-            ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
-                environment without a finite candidate, which is named.
+        Raises ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
+        environment without a finite candidate, which is named.
         """
         check_scenes(state, generators, steps_left)
         size, plans, reward = ENVIRONMENTS_ON_PROCESSOR, [], as_reward(reward)
@@ -163,8 +162,7 @@ class SearchingPlanner(ABC):
             segments: of a candidate, by default K. samples: number of candidates, by default N.
             early_stopping: whether the search may stop when no candidate can become the best.
 
-        Raises:
-            ValueError: codes must be reparameterised and their prior cannot be.
+        Raises ValueError: codes must be reparameterised and their prior cannot be.
         """
         problem = SearchProblem(
             space,
@@ -186,8 +184,7 @@ class SearchingPlanner(ABC):
     def added(self, hook: str, value: Value, *arguments: Any) -> Value:
         """A value after every addition's `hook(value, *arguments)`, in the order in which they act.
 
-        Raises:
-            ValueError: an addition returned another kind of value, or another shape.
+        Raises ValueError: an addition returned another kind of value, or another shape.
         """
         for addition in self.additions:
             before, value = value, getattr(addition, hook)(value, *arguments)

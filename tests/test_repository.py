@@ -26,8 +26,6 @@ DISTRIBUTIONS = {
     "gym_pusht": "gym-pusht",
     "gymnasium_robotics": "gymnasium-robotics",
     "hydra": "hydra-core",
-    "imageio_ffmpeg": "imageio-ffmpeg",
-    "mpl_toolkits": "matplotlib",
     "pybullet_data": "pybullet",
     "pybullet_utils": "pybullet",
     "pyro": "pyro-ppl",

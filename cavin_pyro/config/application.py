@@ -33,16 +33,8 @@ if TYPE_CHECKING:
 else:
     DictConfig = Any
 
-RESUMING = (
-    "collect",
-    "pretrain",
-    "train",
-    "evaluate",
-    "check",
-    "reproduce",
-    "quickstart",
-    "assets",
-)  # docs/reliability.md
+# docs/reliability.md
+RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "quickstart", "assets")
 _TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENODEV}  # the last: to map a folder
 _DENIED = {errno.EACCES, errno.EPERM}
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, *_DENIED, *_TAKEN}

@@ -25,11 +25,8 @@ def log_weights(
 ) -> Tensor:
     """Logarithms of p(observed, codes) / q(codes) for K samples of the codes of each window `[B]`, in nats.
 
-    Args:
-        fixed: values of codes `[K, B, D]` that are not sampled. Their densities stay in the weight.
-
-    Returns:
-        `[K, B]`, float64.
+    `fixed`: values of codes `[K, B, D]` that are not sampled. Their densities stay in the weight. Returns `[K, B]`,
+    float64.
     """
     pieces = []
     step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))

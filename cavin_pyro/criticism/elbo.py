@@ -46,9 +46,7 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4)
     f sums next_centers and next_features over the T transitions of a window; sites without a label of ours (of a
     user's own model) stand under their own names. A term of a window is its mean over samples from the guide.
 
-    Args:
-        windows: training windows, and as many held-out ones, at most.
-        samples: samples of the guide for each window.
+    `windows`: training windows, and as many held-out ones, at most. `samples`: samples of the guide for each window.
     """
     parts = {"training": context.trained_on(windows), "validation": context.held_out(windows)}
     with seeded(context.seed):

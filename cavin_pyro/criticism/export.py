@@ -43,8 +43,7 @@ UNITS = dict.fromkeys(("subgoal_centers", "next_centers", "first_centers"), "met
 def check_export(file: str | None) -> Path | None:
     """The option `export`, before anything is computed.
 
-    Raises:
-        UserError: not a .nc file. OSError: its folder cannot be made.
+    Raises UserError: not a .nc file. OSError: its folder cannot be made.
     """
     if file is None:
         return None

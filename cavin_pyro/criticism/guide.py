@@ -156,9 +156,8 @@ def simulated_ranks(model: Model, guide: Program, window: Window, *, samples: in
 def code_coverage(simulated: SimulatedRanks, name: str, episodes: Tensor) -> dict[str, Any]:
     """What 90 % intervals of a code cover, for windows of `episodes: [B]`.
 
-    Returns:
-        Intervals over `all` dimensions and over the `informed` ones; `by_dimension`; `dimensions` and
-        `informed_dimensions`; `contraction`.
+    Returns intervals over `all` dimensions and over the `informed` ones; `by_dimension`; `dimensions` and
+    `informed_dimensions`; `contraction`.
     """
     inside = covered(simulated.ranks[name], LEVEL)
     return {
@@ -174,9 +173,8 @@ def code_coverage(simulated: SimulatedRanks, name: str, episodes: Tensor) -> dic
 def importance(context: CheckContext, windows: int, particles: int) -> dict[str, Any]:
     """Pareto-smoothed importance weights of the guide on real windows, by ArviZ.
 
-    Returns:
-        `limit` of k-hat for so many particles; intervals of the share of windows that are `unreliable` (above it), and
-        of the `effective` sample size.
+    Returns `limit` of k-hat for so many particles; intervals of the share of windows that are `unreliable` (above it),
+    and of the `effective` sample size.
     """
     window, episodes = context.held_out(windows)
     with seeded(context.seed):

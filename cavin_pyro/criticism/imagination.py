@@ -67,8 +67,7 @@ class Imagined(NamedTuple):
 def imagine(model: Model, world: World, *, seed: int = 0, effects: int = 8, motions: int = 4) -> Imagined:
     """Sample c ~ p(c | s) and z ~ p(z | s, c) in the scene of a seed, and carry out a = g(s, c, z) from it.
 
-    Raises:
-        UserError: the model has other codes than these two.
+    Raises UserError: the model has other codes than these two.
     """
     if model.codes != CODES:
         raise UserError(
@@ -105,8 +104,7 @@ def draw_imagination(
 ) -> pd.DataFrame:
     """`imagine`, with a panel per effect: its subgoal, and where each motion ends as predicted and as reached.
 
-    Returns:
-        `Imagined.errors`, a row per effect and a column per motion; in centimetres on the table.
+    Returns `Imagined.errors`, a row per effect and a column per motion; in centimetres on the table.
     """
     imagined = imagine(model, world, seed=seed, effects=effects, motions=motions)
     (left, top), (right, bottom) = _box(imagined, world)

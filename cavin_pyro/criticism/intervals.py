@@ -55,9 +55,7 @@ EXPLANATION = (
 def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int = 200) -> Section:
     """Coverage of central intervals of f, h and g, and their scales beside their errors.
 
-    Args:
-        windows: held-out windows, at most.
-        samples: samples of each prediction.
+    `windows`: held-out windows, at most. `samples`: samples of each prediction.
     """
     (window, episodes), space = context.held_out(windows), context.space
     with seeded(context.seed):
@@ -168,9 +166,8 @@ def sample_sites(
 def score(prediction: Prediction, ranks: Tensor, episodes: Tensor) -> dict[str, Any]:
     """How well a prediction whose truth has `ranks: [B, ...]` holds, for windows of `episodes: [B]`.
 
-    Returns:
-        Intervals of the coverage by level, `"50"` and `"90"`; `stated`: root of the mean variance of the samples;
-        `error`: root of the mean squared error of their mean.
+    Returns intervals of the coverage by level, `"50"` and `"90"`; `stated`: root of the mean variance of the samples;
+    `error`: root of the mean squared error of their mean.
     """
     samples, real, counted = prediction
     count = counted.double().flatten(1).sum(1)

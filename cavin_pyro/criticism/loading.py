@@ -93,13 +93,9 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
     """Read what the options `checkpoint`, `trust`, `data`, `windows`, `seed` and `env` of `check` name.
 
     Windows are chosen and held out with the checkpoint's own configuration and seed, so that the held-out episodes are
-    those that its training held out.
-
-    Returns:
-        The context, and `about` for the report (see `cavin_pyro.criticism.report`).
-
-    Raises:
-        UserError: a checkpoint without model, guide or window configuration, or data or a world that cannot be used.
+    those that its training held out. Returns the context, and `about` for the report (see
+    `cavin_pyro.criticism.report`). Raises UserError: a checkpoint without model, guide or window configuration, or data
+    or a world that cannot be used.
     """
     world, on_table = world_of(config), collecting_world(config.env)
     checkpoint, table, folders = load_trained(config)
@@ -146,8 +142,7 @@ def load_context(config: DictConfig) -> tuple[CheckContext, dict[str, Any]]:
 def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowTable, list[Path]]:
     """The checkpoint that the options name, with its programs, and the windows of `data` as its training split them.
 
-    Raises:
-        UserError: see `load_context`.
+    Raises UserError: see `load_context`.
     """
     checkpoint = load(config.checkpoint, trust=list(config.trust))
     check_fit(checkpoint.model, checkpoint.geometry)
@@ -170,11 +165,8 @@ def load_trained(config: DictConfig) -> tuple[Checkpoint, WindowTable, list[Path
 def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
     """Whether a checkpoint was trained on a dataset, by the fingerprints in its provenance.
 
-    Returns:
-        `folder`, `transitions`, `seed`, `fingerprint`; `same`: true or false, None where it cannot be told; `verdict`.
-
-    Raises:
-        UserError: no dataset.
+    Returns `folder`, `transitions`, `seed`, `fingerprint`; `same`: true or false, None where it cannot be told;
+    `verdict`. Raises UserError: no dataset.
     """
     record, entries = content_record(folder), trained.get("data")
     entries = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
@@ -193,8 +185,7 @@ def compare_data(folder: Path, trained: Mapping[str, Any]) -> dict[str, Any]:
 def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
     """Which windows a checkpoint was trained on: their configuration, T, and the seed of the split.
 
-    Raises:
-        UserError: the checkpoint does not tell them.
+    Raises UserError: the checkpoint does not tell them.
     """
     try:
         if "windows" not in checkpoint.config:

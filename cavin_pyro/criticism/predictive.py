@@ -52,9 +52,7 @@ TOUCH = (
 def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: int = 200) -> Section:
     """Prior and posterior predictive checks on held-out windows.
 
-    Args:
-        windows: held-out windows, at most.
-        replicates: datasets generated per source.
+    `windows`: held-out windows, at most. `replicates`: datasets generated per source.
     """
     window, episodes = context.held_out(windows)
     nearness = Nearness.of(observed(context.training), context.space)
@@ -148,8 +146,7 @@ def compare(values: Tensor, real: Tensor) -> dict[str, float]:
 def effect_size(replicated: Tensor, real: Tensor, episodes: Tensor) -> Interval:
     """How much more the model has than was observed, in standard deviations of single windows; NaN if these are 0.
 
-    Args:
-        replicated: `[R, B]` or `[R, B, T]`. real: `[B]` or `[B, T]`.
+    `replicated`: `[R, B]` or `[R, B, T]`. `real`: `[B]` or `[B, T]`.
     """
     count = len(episodes)
     expected = replicated.double().mean(0).reshape(count, -1).mean(-1)

@@ -52,8 +52,7 @@ EXPLANATION = (
 def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
     """AUC of a classifier that tells the guide's codes from the prior's, on held-out windows.
 
-    Args:
-        windows: held-out windows, at most.
+    `windows`: held-out windows, at most.
     """
     window, episodes = context.held_out(windows)
     if reason := unsuitable_codes(context, window):
@@ -172,11 +171,7 @@ def decoded_summary(outcome: GeneratedWindow, space: Space) -> Tensor:
 def held_out_logits(first: Tensor, second: Tensor, episodes: Tensor, seed: int) -> tuple[Tensor, Tensor]:
     """Log odds of being of the first sample, for both rows `[N, P]` of each pair, by a network of other episodes.
 
-    Args:
-        episodes: of the pairs `[N]`, at least two.
-
-    Returns:
-        `[N]` each.
+    `episodes`: of the pairs `[N]`, at least two. Returns `[N]` each.
     """
     names, which = torch.unique(episodes, return_inverse=True)
     folds = min(FOLDS, len(names))

@@ -49,8 +49,7 @@ class Nearness:
 class Statistic:
     """One number per window, or per push of a window.
 
-    Attributes:
-        function: of an `GeneratedWindow` `[B]` -> `[B]` or `[B, T]`. part: of the model, that makes it: h, f or g.
+    `function`: of an `GeneratedWindow` `[B]` -> `[B]` or `[B, T]`. `part`: of the model, that makes it: h, f or g.
     """
 
     name: str

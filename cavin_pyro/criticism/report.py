@@ -67,8 +67,7 @@ def page(about: Mapping[str, Any], parts: Sequence[Part]) -> str:
 def plain(value: Any) -> Any:
     """Numbers, arrays, mappings and intervals as JSON knows them; what is not finite becomes None.
 
-    Raises:
-        TypeError: there is something else in it.
+    Raises TypeError: there is something else in it.
     """
     if isinstance(value, Interval):
         value = value._asdict()

@@ -27,8 +27,7 @@ MINIMUM_EPISODES = 50
 class Verdict:
     """What a section concludes.
 
-    Attributes:
-        level: good, inspect, bad, too few or none. rule: how it came about. advice: what to do next.
+    `level`: good, inspect, bad, too few or none. `rule`: how it came about. `advice`: what to do next.
     """
 
     level: str

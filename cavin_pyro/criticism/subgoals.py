@@ -158,8 +158,7 @@ def subgoal_rollouts(
 ) -> Iterator[list[SubgoalRollout]]:
     """In each scene, one rollout per way to obtain a motion; scene k depends on the seed and k alone.
 
-    Args:
-        samples: N, the number of candidates for the closest motion.
+    `samples`: N, the number of candidates for the closest motion.
     """
     assert context.world is not None
     with closing(context.world if isinstance(context.world, World) else open_scene(context.world)) as simulator:
@@ -176,11 +175,8 @@ def sample_scene(scene: Scene, ranges: ObjectRanges, seed: int, number: int, obj
 def execute(world: World, actions: Floats, *, to_the_end: bool = False) -> tuple[Floats, bool]:
     """Carry out actions [T, A] from the present state of a world.
 
-    Args:
-        to_the_end: go on where the episode ends.
-
-    Returns:
-        Positions [n, M, P] after each action, with n less than T if the episode ended on the way; whether it ended.
+    `to_the_end`: go on where the episode ends. Returns positions [n, M, P] after each action, with n less than T if the
+    episode ended on the way; whether it ended.
     """
     path, over = [], False
     for action in actions:
@@ -272,14 +268,11 @@ def measure(
     """Numbers of rollouts whose codes were obtained in one way; lengths, shares as fractions, NaN where nothing counts.
 
     Counted in distances are rollouts in which no object was lost. An object is *wanted* where the subgoal lies
-    more than `moving` from it.
-
-    Returns:
-        Shares `unsafe` and `ineffective` of the pushes, `lost` of the rollouts; of objects that moved
-        more than `moving` or were predicted to: `moved` and f's `error`. With subgoals, of the wanted objects:
-        `wanted` (their mean distance to the subgoal at first), `from_subgoal` (at the end), `predicted_from_subgoal`
-        (f's end state), `from_prediction` (at the end; f against physics), and `left`: `from_subgoal` over `wanted`, an
-        interval over scenes.
+    more than `moving` from it. Returns shares `unsafe` and `ineffective` of the pushes, `lost` of the rollouts; of
+    objects that moved more than `moving` or were predicted to: `moved` and f's `error`. With subgoals, of the wanted
+    objects: `wanted` (their mean distance to the subgoal at first), `from_subgoal` (at the end),
+    `predicted_from_subgoal` (f's end state), `from_prediction` (at the end; f against physics), and `left`:
+    `from_subgoal` over `wanted`, an interval over scenes.
     """
     pushes = sum(len(rollout.plan.actions) for rollout in rollouts)
     before, reached, predicted, aim = finished(rollouts)

@@ -69,8 +69,7 @@ Collection = CollectionConfig | WorldCollection
 def collecting_world(env: DictConfig) -> CollectionConfig:
     """The configuration of a collection in the world of `env.*`, with default options.
 
-    Raises:
-        UserError: as `part_of` and `object_ranges`, or another robot than the stick.
+    Raises UserError: as `part_of` and `object_ranges`, or another robot than the stick.
     """
     part_of("robot", env.robot, env.assets)
     if env.robot != WorldConfig.robot:
@@ -99,15 +98,8 @@ def collect(
     order by this process alone: the metadata count a shard only once its file is in place. A killed run therefore
     resumes after the last shard that counts.
 
-    Args:
-        workers: processes.
-
-    Returns:
-        The dataset's metadata.
-
-    Raises:
-        UserError: the folder holds a dataset of another configuration.
-        WorkerError: a worker was killed.
+    `workers`: processes. Returns the dataset's metadata. Raises UserError: the folder holds a dataset of another
+    configuration. WorkerError: a worker was killed.
     """
     metadata = _begin(config, folder)
     damaged = [number for number in range(metadata["shards"]) if not _is_whole(folder, number, metadata)]
@@ -207,8 +199,7 @@ def _record_push(arrays: Arrays, step: int, action: np.ndarray, report: PushRepo
 def open_scene(config: CollectionConfig) -> Scene:
     """The world in which episodes of this configuration are collected.
 
-    Raises:
-        UserError: it has no such part, or files of a part are missing.
+    Raises UserError: it has no such part, or files of a part are missing.
     """
     with user_input():
         return Scene(

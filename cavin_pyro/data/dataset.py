@@ -127,11 +127,8 @@ def write_shard(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_shard(path: Path, names: Sequence[str] | None = None, *, metadata: Mapping[str, Any] | None = None) -> Arrays:
     """Read one shard, or some of its arrays; types, shapes and ranges are checked.
 
-    Args:
-        metadata: of the dataset, with which the numbers of episodes, pushes and objects must agree.
-
-    Raises:
-        UserError: the file is missing, truncated, damaged or not a shard; it is named.
+    `metadata`: of the dataset, with which the numbers of episodes, pushes and objects must agree. Raises UserError: the
+    file is missing, truncated, damaged or not a shard; it is named.
     """
     metadata = metadata or {}
     configuration, arrays, where = metadata.get("configuration", {}), Arrays(), ""
@@ -170,12 +167,8 @@ def _check_agreement(arrays: Arrays, metadata: Mapping[str, Any]) -> None:
 def check_file(file: h5py.File, configuration: Mapping[str, Any], declared: Mapping[str, Declared]) -> None:
     """Check types and shapes of all declared arrays of a file, before any is read.
 
-    Args:
-        configuration: of the collection, which tells E, S and M, and of a world P, F and A. What it lacks, the arrays
-            must agree on.
-
-    Raises:
-        ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
+    `configuration`: of the collection, which tells E, S and M, and of a world P, F and A. What it lacks, the arrays
+    must agree on. Raises ValueError: one does not fit; or one lies in another file, to which HDF5 can link.
     """
     options = {"E": "episodes_per_shard", "S": "steps", "M": "maximum_objects"}
     if space := space_of({"configuration": configuration}):
@@ -211,8 +204,7 @@ def _check_shape(name: str, array: h5py.Dataset, declared: Declared, sizes: dict
 def check_values(name: str, array: NDArray[Any], table: Mapping[str, Declared] = DECLARED) -> None:
     """Check that the values of an array that `table` declares are finite and within their range.
 
-    Raises:
-        ValueError: some are not.
+    Raises ValueError: some are not.
     """
     declared = table.get(name)
     if declared is None or array.dtype == np.bool_ or array.size == 0:
@@ -223,11 +215,7 @@ def check_values(name: str, array: NDArray[Any], table: Mapping[str, Declared] =
 
 
 def padded(arrays: Mapping[str, NDArray[Any]], objects: int) -> Arrays:
-    """Declared arrays of a shard with room for M = `objects`.
-
-    Raises:
-        UserError: one has room for more.
-    """
+    """Declared arrays of a shard with room for M = `objects`. Raises UserError: one has room for more."""
     wider = {}
     for name, array in arrays.items():
         sizes = zip(DECLARED[name].dimensions, array.shape, strict=True)
@@ -246,8 +234,7 @@ def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
 def read_metadata(folder: Path) -> dict[str, Any]:
     """Read and check a dataset's metadata.
 
-    Raises:
-        UserError: there is no dataset, or it has another format or version, or it is damaged or cannot be read.
+    Raises UserError: there is no dataset, or it has another format or version, or it is damaged or cannot be read.
     """
     path = folder / "metadata.json"
     if not path.exists():
@@ -310,10 +297,7 @@ def content_record(folder: Path) -> dict[str, Any]:
     """What identifies a dataset's content: `transitions`, `episodes`, `configuration`, `made_by` and `fingerprint`.
 
     The fingerprint is of the first shard's bytes: twelve hexadecimal digits, equal for equal configuration, program and
-    simulator.
-
-    Raises:
-        UserError: no dataset, or this shard cannot be read.
+    simulator. Raises UserError: no dataset, or this shard cannot be read.
     """
     metadata = read_metadata(folder)
     names = ("transitions", "episodes", "configuration", "made_by")
@@ -324,8 +308,7 @@ def content_record(folder: Path) -> dict[str, Any]:
 def shard_digest(path: Path) -> str:
     """The SHA-256 of a shard's bytes: hexadecimal digits. It takes 3 ms for 2 MB.
 
-    Raises:
-        UserError: the file cannot be read.
+    Raises UserError: the file cannot be read.
     """
     try:
         return file_digest(path)
@@ -336,8 +319,7 @@ def shard_digest(path: Path) -> str:
 def check_distinct(folders: Sequence[Path]) -> None:
     """Check that no dataset is given twice, so that no episode counts twice and none is in training and validation.
 
-    Raises:
-        UserError: two begin with the same shard.
+    Raises UserError: two begin with the same shard.
     """
     known: dict[str, Path] = {}
     for folder in folders:
@@ -350,8 +332,7 @@ def check_distinct(folders: Sequence[Path]) -> None:
 def iterate_shards(folder: Path, names: Sequence[str]) -> Iterator[tuple[int, Arrays]]:
     """Yield (number, arrays) of a dataset's shards in order. names: arrays to read.
 
-    Raises:
-        UserError: no dataset, a corrupt shard, or one that repeats an episode of another.
+    Raises UserError: no dataset, a corrupt shard, or one that repeats an episode of another.
     """
     metadata, known = read_metadata(folder), set[int]()
     for number in range(metadata["shards"]):

@@ -61,8 +61,7 @@ def described(world: World, section: Mapping[Any, Any]) -> dict[str, Any]:
 def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """One episode by the world's policy, of at most `steps`; it ends where the world ends it.
 
-    Raises:
-        UserError: an action of the policy leaves the box, or as `of_states`.
+    Raises UserError: an action of the policy leaves the box, or as `of_states`.
     """
     scene, choices = collection_streams(seed, number)
     policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
@@ -79,9 +78,8 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
 def of_states(world: World, states: Sequence[Any], actions: Any) -> Arrays:
     """An episode of S `actions` `[S, A]` between S + 1 states of a world.
 
-    Raises:
-        ValueError: a state or an action has another shape than the world says, numbers that are not finite, or an
-            action is out of the box.
+    Raises ValueError: a state or an action has another shape than the world says, numbers that are not finite, or an
+    action is out of the box.
     """
     centers, features, masks = (torch.stack(parts) for parts in zip(*states, strict=True))
     if (masks != masks[0]).any():

@@ -36,14 +36,9 @@ DESCRIPTION = (
 def export(folder: Path, target: Path) -> int:
     """Write a dataset as `target/data`, where `minari.load_dataset` finds it with `target`'s parent as its root.
 
-    Minari's `recover_environment` makes its world, of which a line says so if it cannot.
-
-    Returns:
-        How many episodes were written.
-
-    Raises:
-        UserError: Minari is not installed, a name that it does not take, no dataset, a corrupt shard, `target` holds a
-            dataset, or the disk refused.
+    Minari's `recover_environment` makes its world, of which a line says so if it cannot. Returns how many episodes were
+    written. Raises UserError: Minari is not installed, a name that it does not take, no dataset, a corrupt shard,
+    `target` holds a dataset, or the disk refused.
     """
     try:
         import minari

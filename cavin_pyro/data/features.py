@@ -43,8 +43,7 @@ def geometry_fingerprint(geometry: Geometry) -> str:
 def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[np.float32]:
     """Features [..., 64] of clouds [..., P, 3] metres from their centres.
 
-    Raises:
-        ValueError: there are none, or no points in them.
+    Raises ValueError: there are none, or no points in them.
     """
     if not clouds.size:
         raise ValueError(f"clouds have the shape {list(clouds.shape)}: at least one with a point is needed")
@@ -56,11 +55,7 @@ def cloud_features(geometry: Geometry, clouds: NDArray[np.floating]) -> NDArray[
 def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: str) -> NDArray[np.float32]:
     """Features [E, S+1, M, 64] of one shard, read from beside it if the same `geometry` made them of it before.
 
-    Args:
-        fingerprint: see `geometry_fingerprint`.
-
-    Raises:
-        UserError: the shard is corrupt.
+    `fingerprint`: see `geometry_fingerprint`. Raises UserError: the shard is corrupt.
     """
     shard, metadata = dataset.shard_path(folder, number), dataset.read_metadata(folder)
     path = folder / f"features-{fingerprint}" / shard.name
@@ -80,8 +75,7 @@ def shard_features(folder: Path, number: int, geometry: Geometry, fingerprint: s
 def find_held_out(names: Sequence[str], folders: Sequence[Path], *, option: str) -> list[tuple[int, ...]]:
     """The numbers that objects with these names, which are held out of training, have in `shape` of each dataset.
 
-    Raises:
-        UserError: no dataset, or none has an object of such a name; `option` is where the names were given.
+    Raises UserError: no dataset, or none has an object of such a name; `option` is where the names were given.
     """
     known = [dataset.read_metadata(folder).get("shape_names", []) if names else [] for folder in folders]
     every = dict.fromkeys(plain_name(name) for one in known for name in one)
@@ -102,11 +96,8 @@ def sample_clouds(
 ) -> NDArray[np.float32]:
     """Sample clouds [count, 256, 3] metres from datasets, from as many shards as it takes, real objects only.
 
-    Args:
-        held_out_objects: names of objects whose clouds are omitted.
-
-    Raises:
-        UserError: no dataset, a corrupt shard, an object that no dataset knows, or too few clouds are left.
+    `held_out_objects`: names of objects whose clouds are omitted. Raises UserError: no dataset, a corrupt shard, an
+    object that no dataset knows, or too few clouds are left.
     """
     dataset.check_tabletop(folders, "there are no clouds in it")
     excluded = find_held_out(held_out_objects, folders, option="held_out_objects")

@@ -51,8 +51,7 @@ class WindowFinder:
     def add(self, episodes: Arrays, held_out: NDArray[np.bool_] | None = None) -> None:
         """Add the episodes of a shard; `held_out`: which are for validation, `[E]`, by default by their number.
 
-        Raises:
-            UserError: they are too short, or not shaped as the metadata say.
+        Raises UserError: they are too short, or not shaped as the metadata say.
         """
         T, config, positions = self._length, self._config, episodes["centers"].shape[1]
         if positions <= T:
@@ -115,8 +114,7 @@ class WindowFinder:
     def found(self) -> dict[str, Any]:
         """What `cavin_pyro.data.windows.WindowTable` is made of: all states and pushes, and the windows among them.
 
-        Raises:
-            UserError: there is no window to train on, or none to validate with.
+        Raises UserError: there is no window to train on, or none to validate with.
         """
         stored = {name: torch.from_numpy(array[: self._filled]) for name, array in self._stored.items()}
         windows = {name: torch.from_numpy(np.concatenate(parts)) for name, parts in self._windows.items()}

@@ -104,8 +104,7 @@ class WindowTable:
             segment_length: T. negative_fraction: share that is kept of windows in which nothing moves.
             validation_fraction: share of the episodes, at least one, that is for validation, which `seed` chooses.
 
-        Raises:
-            UserError: shapes that do not fit, numbers that are not finite, an action out of its box, or no window.
+        Raises UserError: shapes that do not fit, numbers that are not finite, an action out of its box, or no window.
         """
         with user_input():
             check_number("segment_length", segment_length, 1, whole=True)
@@ -150,8 +149,7 @@ class WindowTable:
     def move(self, device: torch.device, room: int) -> bool:
         """Give batches on a device; also keep states and pushes there if they take at most `room` bytes.
 
-        Returns:
-            Whether they are kept there. If not, each batch is gathered on the CPU and copied.
+        Returns whether they are kept there. If not, each batch is gathered on the CPU and copied.
         """
         tables = (*self._states, self._actions, self._transition_mask)
         self.device = device
@@ -182,8 +180,7 @@ class WindowTable:
     def batch(self, indices: Tensor) -> Window:
         """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`.
 
-        Raises:
-            ValueError: there are none, or no windows of these numbers.
+        Raises ValueError: there are none, or no windows of these numbers.
         """
         low, high = torch.as_tensor(indices).aminmax() if len(indices) else (-1, -1)
         if not 0 <= int(low) <= int(high) < len(self.starts):
@@ -216,8 +213,7 @@ def load_windows(
         segment_length: T. seed: of the split into training and validation.
         storage: folder for a temporary file with all states, which need not fit in memory; by default the system's.
 
-    Raises:
-        UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
+    Raises UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
     every = [dataset.read_metadata(folder) for folder in folders]
@@ -258,8 +254,7 @@ def load_windows(
 def shared_space(folders: Sequence[Path]) -> Space | None:
     """The space of the world that all datasets are of; None for the tabletop.
 
-    Raises:
-        UserError: no dataset, or they are of different worlds.
+    Raises UserError: no dataset, or they are of different worlds.
     """
     every = [dataset.read_metadata(folder) for folder in folders]
     for name in ("world", "space", "objects", "features"):

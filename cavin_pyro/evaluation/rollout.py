@@ -30,9 +30,8 @@ OUTCOMES = ("success", "violation", "fall", "timeout")
 class PlanRecord:
     """One plan, with the observation behind it. `rollout` executes T of its pushes, or fewer.
 
-    Attributes:
-        step: pushes made before. centers: [M, 3] metres and mask: [M], as observed. plan: for one environment.
-        milliseconds: from the observation to the plan. photograph: [height, width, 3], if asked for.
+    `step`: pushes made before. `centers`: [M, 3] metres and `mask`: [M], as observed. `plan`: for one environment.
+    `milliseconds`: from the observation to the plan. `photograph`: [height, width, 3], if asked for.
     """
 
     step: int

@@ -37,8 +37,7 @@ def hierarchical_interval(success: np.ndarray, groups: np.ndarray) -> tuple[floa
 
     Episodes of a group, sampled with replacement, succeed as often as a binomial variable says.
 
-    Args:
-        success: bool [N]. groups: [N], the training seed of each episode.
+    `success`: bool [N]. `groups`: [N], the training seed of each episode.
     """
     generator = np.random.default_rng(0)
     values = [success[groups == name] for name in np.unique(groups)]

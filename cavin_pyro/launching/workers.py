@@ -33,9 +33,8 @@ def run_jobs(
         workers: processes; with 1 jobs run in this one, in their order.
         ordered: in the order of the jobs, instead of as they finish.
 
-    Raises:
-        WorkerError: a worker was killed.
-        Exception: whatever the function raises, with the worker's traceback as its cause.
+    Raises WorkerError: a worker was killed. Exception: whatever the function raises, with the worker's traceback as its
+    cause.
     """
     if workers == 1:
         yield from ((number, function(job)) for number, job in enumerate(jobs))

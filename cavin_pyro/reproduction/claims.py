@@ -36,12 +36,9 @@ def difference(one: Rate, other: Rate) -> tuple[float, float, float]:
 def claims(rates: pd.DataFrame, tests: pd.DataFrame, *, planner: str, criterion: str) -> list[Claim]:
     """Of one kind of planner and one criterion; those whose cells were not measured are left out.
 
-    Args:
-        rates: `cavin_pyro.reproduction.table.rates`. tests: `paired_tests`.
-
-    Returns:
-        For each its `claim`, what stands in the paper, what was measured `here`, and whether it `holds`: "yes" or "no",
-        with ", within chance" where the interval includes the opposite; empty for figures alone.
+    `rates`: `cavin_pyro.reproduction.table.rates`. `tests`: `paired_tests`. Returns for each its `claim`, what stands
+    in the paper, what was measured `here`, and whether it `holds`: "yes" or "no", with ", within chance" where the
+    interval includes the opposite; empty for figures alone.
     """
     place = ["method", "task", "reward", "objects"]
     own, compared = (

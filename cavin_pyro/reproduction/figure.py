@@ -23,9 +23,8 @@ TITLES = {"paper": "planners as in the paper", "ours": "planners with our additi
 def draw_figure(path: Path, rates: pd.DataFrame, *, planner: str, criterion: str) -> None:
     """Both rows of the paper's figure, for one kind of planner and one criterion.
 
-    Args:
-        rates: as in `cavin_pyro.reproduction.table.rates`. Bars and lines are rates of success, whiskers the wider
-            of the two intervals on each side.
+    `rates`: as in `cavin_pyro.reproduction.table.rates`. Bars and lines are rates of success, whiskers the wider of the
+    two intervals on each side.
     """
     own = rates[(rates["planner"] == planner) & (rates["criterion"] == criterion)]
     tasks = list(own["task"].unique())

@@ -49,8 +49,7 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> pd.Data
             With more `episodes` or other `planners` than an earlier run, only what is missing is run.
         device: cpu or cuda, on which networks are trained and plan; collection runs on the CPU.
 
-    Raises:
-        UserError: an option that cannot be used, or a stage that failed.
+    Raises UserError: an option that cannot be used, or a stage that failed.
     """
     size = chosen_size(config)
     if not config.models:
@@ -72,8 +71,7 @@ def run_pipeline(config: DictConfig, home: Path, device: str = "cpu") -> pd.Data
 def chosen_size(config: DictConfig) -> Size:
     """The size that `scale` names, with the given episodes, scenes, tasks, rewards and numbers of objects.
 
-    Raises:
-        UserError: more episodes than there are scenes.
+    Raises UserError: more episodes than there are scenes.
     """
     size = SIZES[config.scale]
     names = ("episodes", "bottom_episodes", "first_scene", "priors")
@@ -101,8 +99,7 @@ def chosen_cells(size: Size, config: DictConfig) -> list[Cell]:
 def check_inputs(config: DictConfig) -> None:
     """Check what a run reads and chooses, before it writes anything.
 
-    Raises:
-        UserError: an option that cannot be used, or a model that is missing.
+    Raises UserError: an option that cannot be used, or a model that is missing.
     """
     wanted = chosen_cells(chosen_size(config), config)
     if not wanted:
@@ -150,8 +147,7 @@ def run_stages(stages: Sequence[Stage], workers: int) -> None:
 def run_stage(stage: Stage) -> Path:
     """Run a command in this process; returns its folder, where `log.txt` has what it prints.
 
-    Raises:
-        UserError: it failed. KeyboardInterrupt: a signal ended it.
+    Raises UserError: it failed. KeyboardInterrupt: a signal ended it.
     """
     set_matmul_precision("float32")  # which a training here before may have changed
     stage.folder.mkdir(parents=True, exist_ok=True)

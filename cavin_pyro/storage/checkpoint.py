@@ -45,8 +45,7 @@ Module = TypeVar("Module", bound=nn.Module)
 class Checkpoint:
     """What a file of `save` or of the command `train` holds.
 
-    Attributes:
-        path: of the file. config: of the parts. provenance: of the weights. tensors: by `part.parameter`.
+    `path`: of the file. `config`: of the parts. `provenance`: of the weights. `tensors`: by `part.parameter`.
     """
 
     path: Path
@@ -226,8 +225,6 @@ def load(name_or_path: str | Path, *, trust: Sequence[str] = ()) -> Checkpoint:
 
 def find_checkpoint(name: str | Path) -> Path:
     """The file of a shipped checkpoint by its name, such as `cavin`, or of another by its path, or a `UserError`."""
-    if not isinstance(name, str | os.PathLike):
-        raise UserError(f"a checkpoint has a path, or a name such as 'cavin', and is no {type(name).__name__}")
     path = Path(name)  # os.path.isfile, unlike that of paths, takes any name
     if path.suffix or len(path.parts) > 1 or os.path.isfile(path):
         return path

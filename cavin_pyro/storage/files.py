@@ -98,8 +98,7 @@ def holds_no_result(folder: Path) -> bool:
 def clear_abandoned(folder: Path, *, older_than: float = 0.0) -> None:
     """Delete what a killed run left half-written in a folder. Nobody else may write there now.
 
-    Args:
-        older_than: seconds; leave younger files, for a folder that others may write into.
+    `older_than`: seconds; leave younger files, for a folder that others may write into.
     """
     for path in folder.glob(f".*{OURS}{'[0-9a-f]' * 8}{PARTIAL}*"):  # users' own partial downloads may lie there too
         with suppress(FileNotFoundError):

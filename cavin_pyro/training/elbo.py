@@ -39,10 +39,9 @@ def window_terms(
         fixed: values of codes, `[B, D]` or `[K, B, D]`, that replace samples from the guide. Their terms
             are still the guide's and the model's densities at these values.
 
-    Returns:
-        `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`. An
-        automatic guide of Pyro's has its density at auxiliary sites, each a term `kl_<site>` more: `[]` if one density
-        is that of all windows.
+    Returns `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`. An
+    automatic guide of Pyro's has its density at auxiliary sites, each a term `kl_<site>` more: `[]` if one density is
+    that of all windows.
     """
     with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
         guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window)
@@ -78,9 +77,8 @@ def latent_sites(trace: poutine.Trace) -> Sites:
 def sum_out(sites: Sites) -> tuple[Callable[[Tensor], Tensor], dict[str, Tensor]]:
     """Sums enumerated sites out of the model's `sites`, whose log densities are computed.
 
-    Returns:
-        The expectation of a log density over their exact posterior, and by site the divergence of that from its prior.
-        Without such sites the expectation is the identity.
+    Returns the expectation of a log density over their exact posterior, and by site the divergence of that from its
+    prior. Without such sites the expectation is the identity.
     """
     dims = {name: site["infer"]["_enumerate_dim"] for name, site in sites.items() if "_enumerate_dim" in site["infer"]}
     if not dims:
@@ -118,8 +116,7 @@ def substitute(program: Program, values: Mapping[str, Tensor]) -> Program:
 def elbo_terms(model: Program, guide: Program, window: Window) -> dict[str, Tensor]:
     """Each term of the loss -ELBO for a batch [B], from one sample of the codes; their sum is Trace_ELBO's loss.
 
-    Returns:
-        The terms of `window_terms`: scalars, summed over windows.
+    Returns the terms of `window_terms`: scalars, summed over windows.
     """
     return {name: term.sum() for name, term in window_terms(model, guide, window).items()}
 

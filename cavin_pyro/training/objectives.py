@@ -40,8 +40,7 @@ class Objective:
         rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
             each step already, so a weight trades its density for the accuracy of rollouts.
 
-    Raises:
-        ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
+    Raises ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
     """
 
     def __init__(
@@ -184,8 +183,7 @@ def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) 
     s' under the likelihood scales. Objects count that are real in both, windows where `sequence_mask` is set.
     The term is of the published code, for an ablation; the paper asserts that the actions of (s, c, z) lead to h(s, c).
 
-    Args:
-        codes: the sampled `effect_code` and `motion_code`, those of the two that the model has.
+    `codes`: the sampled `effect_code` and `motion_code`, those of the two that the model has.
     """
     state, last = window.first, window.last
     for action in model.actions(state, **codes).unbind(-2):

@@ -46,9 +46,8 @@ def pretrain(
             equals that of an unbroken run.
         device: of the steps; the batches are chosen and augmented on the CPU, where the autoencoder is in the end.
 
-    Returns:
-        Validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one
-        average cloud for all. A loss that is not finite, or a damaged resume file, is a `UserError`.
+    Returns validation losses in units of (0.1 m) squared: `validation`, and `mean_shape`, the loss of one average cloud
+    for all. A loss that is not finite, or a damaged resume file, is a `UserError`.
     """
     generator = np.random.default_rng(seed)
     held_out = max(1, len(clouds) // 10)

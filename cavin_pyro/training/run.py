@@ -250,8 +250,7 @@ def build_objective(config: Config, model: Model, guide: Guide | None = None) ->
 def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometry | None) -> dict[str, Any]:
     """Copy the weights of the checkpoint `config.initial` into model and guide; other parts are a `UserError`.
 
-    Returns:
-        Its digest and provenance, for that of the new one.
+    Returns its digest and provenance, for that of the new one.
     """
     checkpoint = load(config.initial)
     checkpoint.load_into("model", model)

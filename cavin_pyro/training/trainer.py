@@ -52,9 +52,8 @@ Row = dict[str, float]
 class Trainer:
     """Trains one model and guide on windows, all on their device.
 
-    Args:
-        objective: what is minimised. folder: where metrics and the resume file go. seed: of batches and codes.
-        save: called with the step and the metrics whenever the validation loss is the best so far.
+    `objective`: what is minimised. `folder`: where metrics and the resume file go. `seed`: of batches and codes.
+    `save`: called with the step and the metrics whenever the validation loss is the best so far.
     """
 
     def __init__(
@@ -204,10 +203,7 @@ class Trainer:
             writer = csv.DictWriter(file, fieldnames=list(self.rows[0]))
             writer.writeheader()
             writer.writerows(self.rows)
-        tensors: dict[str, Tensor] = {
-            **random_states(self.windows.device),
-            "batches": self._batches.get_state(),
-        }
+        tensors = random_states(self.windows.device) | {"batches": self._batches.get_state()}
         tensors |= self._programs.state_dict()
         write_resume(self.resume_path, tensors | optimizer_tensors(self._optimizer), {"rows": self.rows})
 
@@ -252,8 +248,7 @@ class Trainer:
 def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
     """Mirror some of the windows `[B]` in the plane y = 0, for worlds that are symmetric about it.
 
-    Args:
-        which: `[B]` bool. signs: `[F]`, of features, see `Geometry.mirror_signs`.
+    `which`: `[B]` bool. `signs`: `[F]`, of features, see `Geometry.mirror_signs`.
     """
     flip = 1.0 - 2.0 * which.to(window.actions.dtype)[:, None]  # [B, 1]
     same = torch.ones_like(flip)

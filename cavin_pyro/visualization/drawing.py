@@ -106,8 +106,7 @@ def single_target(world: World) -> bool:
 def candidate_subgoals(record: PlanRecord, objects: list[int], *, count: int = CANDIDATES) -> tuple[Floats, Floats]:
     """Some of the candidate subgoals of some objects.
 
-    Returns:
-        Positions [n, P] and returns [n] of their plans with n at most `count`, best last.
+    Returns positions [n, P] and returns [n] of their plans with n at most `count`, best last.
     """
     centers, returns = (part[0].numpy() for part in (record.plan.candidate_centers, record.plan.candidate_returns))
     points = centers[:, :, [index for index in objects if index < centers.shape[2]]]  # [N, K, objects, P]
@@ -192,9 +191,8 @@ def trail(episode: Episode, count: int) -> Floats:
 def draw_episode(path: Path, episode: Episode, world: World) -> None:
     """Draw at most three plans, evenly spread and in temporal order, and the end, without what a planner lacks.
 
-    Args:
-        episode: its plans hold pictures, if the world has any.
-        world: in which it ended; its goal is still the episode's.
+    `episode`: its plans hold pictures, if the world has any. `world`: in which it ended; its goal is still the
+    episode's.
     """
     count = len(episode.plan_records)
     chosen = [episode.plan_records[i] for i in np.linspace(0, count - 1, min(PANELS, count)).round().astype(int)]

@@ -32,8 +32,7 @@ class LiveLoop(EpisodeCallback):
 
     It is the planner of its own rollouts: before each plan it waits while paused, and does what was asked.
 
-    Args:
-        config: of the command `plan`. say: told in a line what happens. plans: to make before the first pause.
+    `config`: of the command `plan`. `say`: told in a line what happens. `plans`: to make before the first pause.
     """
 
     def __init__(self, config: DictConfig, *, say: Callable[[str], None] = print, plans: float = 0) -> None:

@@ -63,8 +63,7 @@ class EpisodeProgress(EpisodeCallback):
 def render_episode(runner: EpisodeRunner, folder: Path, *, seed: int, video: str | None) -> dict[str, Any]:
     """Run one episode, print its steps and write `episode_files` about it; returns its results' row.
 
-    Args:
-        video: format of the film, `mp4`, `gif` or `webp`; none is written of a world without pictures.
+    `video`: format of the film, `mp4`, `gif` or `webp`; none is written of a world without pictures.
     """
     env = runner.env
     pictures = env.render_mode is not None

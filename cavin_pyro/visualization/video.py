@@ -62,8 +62,7 @@ class Shot(NamedTuple):
 class Film(EpisodeCallback):
     """Keeps a world's pictures of an episode; `write` draws over them when it is known how the episode ends.
 
-    Attributes:
-        empty: rows above that no picture uses, which are left out.
+    `empty`: rows above that no picture uses, which are left out.
     """
 
     def __init__(self, world: World) -> None:

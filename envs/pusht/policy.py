@@ -28,8 +28,7 @@ ObservationDict = dict[str, NDArray[np.float64]]
 class PushTPolicy:
     """Collects data: goes to a random point of the block's outline, pushes there in a line or a curve, and so on.
 
-    Args:
-        generator: all of the policy's randomness.
+    `generator`: all of the policy's randomness.
     """
 
     def __init__(self, generator: np.random.Generator) -> None:

@@ -97,9 +97,7 @@ class PushT(World):
         weight: of progress in the planner's reward, in units of the criterion's two limits. margin: the part of these
             limits within which a plan has to end.
 
-    Raises:
-        ImportError: gym-pusht is not installed.
-        ValueError: an argument is not one of those above.
+    Raises ImportError: gym-pusht is not installed. ValueError: an argument is not one of those above.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 2}
@@ -170,8 +168,7 @@ class PushT(World):
             options: `state`, 5 numbers (agent, block) or 7 (agent, block, the agent's velocity), and `goal`, 5
                 numbers; instead of a random state, and of a random goal ("pose") or gym-pusht's ("coverage").
 
-        Raises:
-            ValueError: `state` or `goal` has another length, or a number is not finite.
+        Raises ValueError: `state` or `goal` has another length, or a number is not finite.
         """
         super().reset(seed=seed)
         (generator,) = self.np_random.spawn(1)
@@ -192,9 +189,7 @@ class PushT(World):
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Hold one target for five steps of the simulator, or until the criterion is met.
 
-        Raises:
-            ValueError: the action is not two finite numbers.
-            RuntimeError: called before `reset`.
+        Raises ValueError: the action is not two finite numbers. RuntimeError: called before `reset`.
         """
         if self._steps < 0:
             raise RuntimeError("call reset() before step()")
@@ -242,16 +237,13 @@ class PushT(World):
         self.pose = np.array([*disc.clip(WALLS[0] + RADIUS, WALLS[1] - RADIUS), *block])
 
     def policy(self, generator: np.random.Generator) -> PushTPolicy:
-        """See `World`."""
         return PushTPolicy(generator)
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
-        """See `World`."""
         return np.asarray(centers, dtype=np.float64) * (PICTURE / SIZE)
 
     @property
     def landmarks(self) -> dict[str, NDArray[np.floating]]:
-        """See `World`."""
         return {"goal": self.pose[2:4]}
 
     def arrows(self, actions: NDArray[np.floating], centers: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -273,7 +265,6 @@ class PushT(World):
         return np.array(self._simulator.render())
 
     def close(self) -> None:
-        """Free the simulator."""
         self._simulator.close()
 
     def _is_success(self) -> bool:

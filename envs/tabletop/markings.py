@@ -49,8 +49,7 @@ def paint_of(
 ) -> Paint:
     """Paint groups of tiles, and over them a disc at each object's place.
 
-    Args:
-        places: centres of the discs. colors: of each disc, red, green and blue from 0 to 1.
+    `places`: centres of the discs. `colors`: of each disc, red, green and blue from 0 to 1.
     """
     rows, columns = (numbers.ravel() for numbers in np.indices((camera.height, camera.width)))
     ahead = camera.points(np.ones((camera.height, camera.width)), rows, columns) - np.array(camera.position)

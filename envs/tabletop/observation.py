@@ -39,8 +39,7 @@ class Observation:
 class LatestClouds:
     """The latest point cloud of each of an episode's objects.
 
-    Args:
-        generator: samples each cloud's points from its pixels. slots: M.
+    `generator`: samples each cloud's points from its pixels. `slots`: M.
     """
 
     def __init__(self, generator: np.random.Generator, slots: int = OBJECT_SLOTS) -> None:

@@ -161,8 +161,7 @@ class PushingEnv(Uncopied, World):
         Args:
             options: `layout`, the number of one of the environment's `tasks`, instead of a random one.
 
-        Raises:
-            ValueError: the layout has no room for the objects, or there is no layout of that number.
+        Raises ValueError: the layout has no room for the objects, or there is no layout of that number.
         """
         super().reset(seed=seed)
         (scene_generator,) = self.np_random.spawn(1)
@@ -186,9 +185,7 @@ class PushingEnv(Uncopied, World):
     def step(self, action: NDArray[np.float32]) -> tuple[ObservationDict, float, bool, bool, dict[str, Any]]:
         """Push, wait until the objects rest, observe them, and compute the reward.
 
-        Raises:
-            ValueError: the action is not four finite numbers.
-            RuntimeError: called before `reset`.
+        Raises ValueError: the action is not four finite numbers. RuntimeError: called before `reset`.
         """
         if self._observation is None:
             raise RuntimeError("call reset() before step()")
@@ -218,7 +215,6 @@ class PushingEnv(Uncopied, World):
         return self.scene.photograph(SPECTATOR) if self.render_mode == "rgb_array" else None
 
     def pixels(self, centers: NDArray[np.floating]) -> NDArray[np.float64]:
-        """See `World`."""
         return SPECTATOR.project(centers)
 
     @property
@@ -240,7 +236,6 @@ class PushingEnv(Uncopied, World):
 
     @property
     def name(self) -> str:
-        """See `World`."""
         return self.task.name
 
     def check_starts(self, seed: int) -> None:
@@ -259,11 +254,9 @@ class PushingEnv(Uncopied, World):
         return state_of(observation, self.geometry)
 
     def observed(self, observation: Mapping[str, NDArray[Any]]) -> ObservedPoints:
-        """See `World`."""
         return ObservedPoints.of(observation)
 
     def positions(self, observation: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """See `World`."""
         return observation["centers"], observation["mask"].astype(np.bool_)
 
     def goal(self, device: str | torch.device = "cpu") -> TaskReward:
@@ -274,7 +267,6 @@ class PushingEnv(Uncopied, World):
         return known[key]
 
     def goals(self) -> NDArray[np.float64]:
-        """See `World`."""
         return self.task.goals()
 
     def move_goals(self, goals: NDArray[np.float64]) -> None:
@@ -285,7 +277,6 @@ class PushingEnv(Uncopied, World):
         self.scene.markings, self.scene.places = self.task.tile_groups(), self.task.object_places()
 
     def close(self) -> None:
-        """Free the simulator."""
         self.scene.close()
 
     def _begin(self, task: Task) -> None:
@@ -307,11 +298,8 @@ class PushingEnv(Uncopied, World):
 def state_of(observation: Mapping[str, NDArray[Any]], geometry: Geometry) -> State:
     """The state `[]` of an observation, without needless padding.
 
-    Args:
-        observation: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. geometry: on the CPU.
-
-    Raises:
-        ValueError: no object, or numbers of one that are not finite.
+    `observation`: `centers`, `clouds` and `mask` of `Observation`, [M, ...]. `geometry`: on the CPU. Raises ValueError:
+    no object, or numbers of one that are not finite.
     """
     real = np.flatnonzero(observation["mask"])
     for name in ("clouds", "centers"):

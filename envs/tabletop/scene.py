@@ -73,8 +73,7 @@ class Scene(Uncopied):
         robot: one of `ROBOTS`, or a factory of robots. assets: folder of the files that some robots need.
         slots: M, the objects that observations have room for.
 
-    Raises:
-        ValueError: unknown camera, segmentation or robot, or its files are missing.
+    Raises ValueError: unknown camera, segmentation or robot, or its files are missing.
     """
 
     def __init__(
@@ -113,12 +112,8 @@ class Scene(Uncopied):
     ) -> Observation:
         """Sample scenes until one settles with every object on the table, in view and acceptable.
 
-        Args:
-            areas: start area of each object; the first is the target.
-            generator: the scene's stream, from which those of objects and points derive (`cavin_pyro.envs.randomness`).
-
-        Raises:
-            NoRoomError: no such scene was found.
+        `areas`: start area of each object; the first is the target. `generator`: the scene's stream, from which those
+        of objects and points derive (`cavin_pyro.envs.randomness`). Raises NoRoomError: no such scene was found.
         """
         for _ in range(SCENE_SAMPLES):
             scene_generator, point_generator = generator.spawn(2)
@@ -130,11 +125,7 @@ class Scene(Uncopied):
         )
 
     def reset(self, objects: Sequence[ObjectParameters], point_generator: np.random.Generator) -> Observation:
-        """Build a scene, let it settle, and observe it.
-
-        Raises:
-            ValueError: no object, or more than `slots`.
-        """
+        """Build a scene, let it settle, and observe it. Raises ValueError: no object, or more than `slots`."""
         if not 1 <= len(objects) <= self.slots:
             raise ValueError(f"a scene holds 1 to {self.slots} objects, not {len(objects)}")
         self.world.reset()
@@ -152,8 +143,7 @@ class Scene(Uncopied):
     def push(self, action: NDArray[np.floating]) -> PushReport:
         """Execute one normalised push [4] and wait until the objects rest.
 
-        Raises:
-            ValueError: the action is not four finite numbers.
+        Raises ValueError: the action is not four finite numbers.
         """
         start, end = push_endpoints(finite_numbers("action", action, 4))
         before = self.ground_truth()
@@ -186,8 +176,7 @@ class Scene(Uncopied):
     def observe(self) -> Observation:
         """Take a depth image and turn it into one cloud per object.
 
-        Raises:
-            RuntimeError: the robot stands in the camera's view.
+        Raises RuntimeError: the robot stands in the camera's view.
         """
         return self._observe(self.segmenter.follow)
 

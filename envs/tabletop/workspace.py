@@ -61,11 +61,7 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
 
     The start is scaled onto the reachable box, the motion by `MAXIMUM_MOTION`, the end is clipped to the box.
 
-    Args:
-        action: [..., 4] (x, y, dx, dy), clipped to [-1, 1].
-
-    Returns:
-        start: [..., 2] metres; end: [..., 2] metres.
+    `action`: [..., 4] (x, y, dx, dy), clipped to [-1, 1]. Returns start: [..., 2] metres; end: [..., 2] metres.
     """
     action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)

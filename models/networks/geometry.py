@@ -10,8 +10,7 @@ from cavin_pyro.models.part import Part
 class Geometry(Part):
     """`forward(clouds)`: `[..., P, 3]` from the object's centre, in any order -> unit vectors `[..., F]`.
 
-    Attributes:
-        feature_dimension: F.
+    `feature_dimension`: F.
     """
 
     feature_dimension: int

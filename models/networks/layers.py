@@ -165,8 +165,7 @@ def neighbours(centers: Tensor, mask: Tensor, most: int | None) -> list[Neighbou
     All others where there are no more than `most`, or if it is None; else the nearest, so that relation
     sums do not grow in a crowded scene, and their cost grows with the number of objects, not with its square.
 
-    Args:
-        centers: `[..., M, 2 or more]`. mask: `[..., M]`.
+    `centers`: `[..., M, 2 or more]`. `mask`: `[..., M]`.
     """
     others = mask.shape[-1] - 1
     if most is None or others <= most:

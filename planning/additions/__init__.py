@@ -45,12 +45,8 @@ OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `plan
 def make_additions(additions: Sequence[str | Addition], hooks: Sequence[str]) -> tuple[Addition, ...]:
     """Additions by name, with their defaults, or given, in the order in which they act.
 
-    Args:
-        hooks: which the planner calls.
-
-    Raises:
-        ValueError: an unknown name, an object that is no addition, one that is given twice, or one without a hook that
-            the planner calls.
+    `hooks`: which the planner calls. Raises ValueError: an unknown name, an object that is no addition, one that is
+    given twice, or one without a hook that the planner calls.
     """
     made = []
     for addition in additions:

@@ -58,10 +58,8 @@ class PerturbedRollouts(Addition):
     failure_cost: float = 0.3
 
     def __post_init__(self) -> None:
-        check_number("candidates", self.candidates, 1, whole=True)
-        check_number("rollouts", self.rollouts, 1, whole=True)
-        check_number("rounds", self.rounds, 1, whole=True)
-        check_number("reduction_factor", self.reduction_factor, 1, whole=True)
+        for name in ("candidates", "rollouts", "rounds", "reduction_factor"):
+            check_number(name, getattr(self, name), 1, whole=True)
         check_number("start_noise", self.start_noise)
         check_number("failure_cost", self.failure_cost)
 

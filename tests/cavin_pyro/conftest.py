@@ -44,6 +44,20 @@ WINDOWS = {  # of a training on `pushes`
 PUSHES = CollectionConfig(seed=3, steps=6, episodes_per_shard=4)  # 3 shards of the data that tests share
 
 
+def ended(
+    main: Callable[[], None], words: Sequence[object], patch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> tuple[int, str, str]:
+    """Run a command in this process; its exit status, output, and errors without progress bars."""
+    patch.setattr(sys, "argv", [*map(str, words)])
+    status = 0
+    try:
+        main()
+    except SystemExit as stop:
+        status = int(stop.code or 0)
+    output, errors = capsys.readouterr()
+    return status, output, "\n".join(line for line in errors.splitlines() if line.startswith("error:"))
+
+
 @dataclass(frozen=True)
 class Case:
     """A command to be run in a folder of its own."""

@@ -149,7 +149,6 @@ def test_the_tabletop_is_the_world_where_none_is_chosen() -> None:
     [
         (["env=nowhere"], "^unknown env 'nowhere': choose from .*pusht.*, or env._target_=CLASS$"),
         ([TARGET, "task=crossing"], "^task is an option of env=tabletop: leave it out"),
-        (["env=pusht", "tiles.goal=[[1,2]]"], "^tiles.goal is an option of env=tabletop"),
         ([TARGET, "env.width=3"], "Line.* got an unexpected keyword argument 'width'"),
         (["env._target_=fractions.Fraction"], "^env Fraction is no world: derive it from"),
         (["env._target_=nowhere.World"], "nowhere"),

@@ -109,15 +109,6 @@ def test_features_are_computed_once_for_model_and_guide_and_are_those_of_each(
     assert len(calls) >= 2
 
 
-def test_a_frozen_encoder_stays_frozen(random_window: Callable[..., Window]) -> None:
-    model, guide = make("cascaded", "cascaded")
-    model.encoder.requires_grad_(False)
-    loss = Trace_ELBO()(model, guide)
-    loss(random_window()).backward()
-    assert all(parameter.grad is None for parameter in model.encoder.parameters())
-    assert all(parameter.grad is not None for parameter in loss.parameters() if parameter.requires_grad)
-
-
 def test_a_flow_guide_begins_as_the_plain_guide_and_every_weight_learns(window: Window) -> None:
     model, guide = make_double(("cascaded", "flow"))
     plain = CascadedGuide(model, width=8).double()

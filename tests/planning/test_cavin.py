@@ -124,14 +124,6 @@ def test_no_randomness_is_shared_between_environments(toy: SimpleNamespace) -> N
         assert torch.equal(source[0].get_state(), generators[index].get_state())
 
 
-def test_the_same_seed_gives_the_same_plan_and_another_seed_another(toy: SimpleNamespace) -> None:
-    state, before = toy.scenes([[START]]), torch.get_rng_state()
-    first, again, other = (plan_with_additions(toy, state, toy.generators(seed)) for seed in (1, 1, 2))
-    assert_same_plans(first, again, 0)
-    assert not torch.equal(first.actions, other.actions)
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_padding_leaves_plans_alone(toy: SimpleNamespace) -> None:
     bare = toy.scenes([[START, (0.4, 0.3)]], gains=(1.0, 0.5))
     padded = toy.scenes([[START, (0.4, 0.3), (-5.0, -5.0), (0.0, float("nan"))]], gains=(1.0, 0.5, 7.0, 1.0))

@@ -29,8 +29,7 @@ _FOLDER = Path(__file__).parent
 def task_class(task: str | type[Task]) -> type[Task]:
     """The class of a task, by its name; a class is returned unchanged.
 
-    Raises:
-        ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
+    Raises ValueError: unknown name, or a class with missing methods or without the decoration that makes its fields.
     """
     if isinstance(task, str):
         check_choice("task", task, TASKS)
@@ -58,12 +57,9 @@ def possible_tasks(
 ) -> tuple[Task, ...]:
     """A task in each of the layouts that an episode may have, equally likely: one, or several for `layout=random`.
 
-    Args:
-        task, layout, tiles: as in `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or those
-            in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`.
-
-    Raises:
-        ValueError: as `load_task`, or tiles for `layout=random`.
+    `task`, `layout`, `tiles`: as in `load_task`; `layout` may be `random` as well: the task's `random_layouts`, or
+    those in this folder. All get the fields of `tiles` that are no lists of tiles, such as `clearance`. Raises
+    ValueError: as `load_task`, or tiles for `layout=random`.
     """
     if layout != RANDOM:
         return (load_task(task, layout, tiles),)
@@ -83,11 +79,8 @@ def generate_task(
 ) -> Task:
     """A task in a new generated layout.
 
-    Args:
-        generator: None generates that of seed 0. tiles: fields that are no lists of tiles, as in `possible_tasks`.
-
-    Raises:
-        ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
+    `generator`: None generates that of seed 0. `tiles`: fields that are no lists of tiles, as in `possible_tasks`.
+    Raises ValueError: unknown task, a task without generated layouts, no layout as wanted, or tiles.
     """
     options = _options(task, GENERATED, tiles)
     generated = task_class(task).generate(wanted, generator or np.random.default_rng(0))
@@ -107,13 +100,9 @@ def _options(task: str | type[Task], layout: str, tiles: Mapping[str, Any] | Non
 def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mapping[str, Any] | None = None) -> Task:
     """A task in one of its layouts, or in that of a YAML file.
 
-    Args:
-        task: a name in `TASKS`, or a class. layout: a number, or the path of a YAML file.
-        tiles: fields that replace those of the layout; None values are ignored.
-
-    Raises:
-        ValueError: unknown task or layout, unreadable file, a key that is unknown or missing, tiles that contradict the
-            task, or a start from which no pushes lead to the goal.
+    `task`: a name in `TASKS`, or a class. `layout`: a number, or the path of a YAML file. `tiles`: fields that replace
+    those of the layout; None values are ignored. Raises ValueError: unknown task or layout, unreadable file, a key that
+    is unknown or missing, tiles that contradict the task, or a start from which no pushes lead to the goal.
     """
     kind = task_class(task)
     path = _path(kind, layout)
@@ -137,8 +126,7 @@ def load_task(task: str | type[Task], layout: int | str | Path = 0, tiles: Mappi
 def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
     """A task in the layout that `content`, lists of tiles by field, describes.
 
-    Raises:
-        ValueError: a key is unknown or missing, or tiles contradict the task.
+    Raises ValueError: a key is unknown or missing, or tiles contradict the task.
     """
     kind = task_class(task)
     keys = kind.layout_keys()

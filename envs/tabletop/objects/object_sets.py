@@ -66,11 +66,7 @@ class ObjectSet(Protocol):
         """All names, in an order that does not change from run to run."""
 
     def asset(self, name: str) -> ObjectAsset:
-        """One object.
-
-        Raises:
-            ValueError: no object has that name, or its files cannot be used.
-        """
+        """One object. Raises ValueError: no object has that name, or its files cannot be used."""
 
 
 class NamedObjects:
@@ -80,7 +76,6 @@ class NamedObjects:
         self.makers, self.names = makers, tuple(makers)
 
     def asset(self, name: str) -> ObjectAsset:
-        """See `ObjectSet`."""
         if name not in self.makers:
             raise ValueError(f"unknown object {name!r}: choose from {listed(self.names)}")
         return self.makers[name](name)
@@ -106,10 +101,8 @@ def scanned_objects(assets: str | Path | None) -> NamedObjects:
 
         {"mug": {"mass": 0.118, "inertia_diag": [1.07e-4, 1.11e-4, 1.47e-4]}, ...}
 
-    `python -m cavin_pyro.assets ycb --to DIR` makes such a folder of the YCB objects.
-
-    Raises:
-        ValueError: no folder was named, or a file in it is missing or damaged; the message says which command makes it.
+    `python -m cavin_pyro.assets ycb --to DIR` makes such a folder of the YCB objects. Raises ValueError: no folder was
+    named, or a file in it is missing or damaged; the message says which command makes it.
     """
     if assets is None:
         raise ValueError(f"these objects are scans, in no folder that was named: give env.assets=DIR; {_GET}")
@@ -137,8 +130,7 @@ OBJECT_SETS: dict[str, Callable[[str | Path | None], ObjectSet]] = {
 def load_object_set(name: str | ObjectSet, assets: str | Path | None = None) -> ObjectSet:
     """The set of that name, or the given one.
 
-    Raises:
-        ValueError: the name is unknown, or the set needs assets that are not there.
+    Raises ValueError: the name is unknown, or the set needs assets that are not there.
     """
     if not isinstance(name, str):
         return name
@@ -149,8 +141,7 @@ def load_object_set(name: str | ObjectSet, assets: str | Path | None = None) -> 
 def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
     """Objects of the set by names, with or without the set's prefix: in a mixed set `mug` means both mugs.
 
-    Raises:
-        ValueError: an unknown name; the message lists the valid ones.
+    Raises ValueError: an unknown name; the message lists the valid ones.
     """
     found = []
     for name in names:
@@ -176,8 +167,7 @@ def _mesh_folder() -> Path:
 def _scan(folder: Path, name: str, values: dict[str, Any]) -> ObjectAsset:
     """Read what a folder has of an object.
 
-    Raises:
-        OSError, ValueError, TypeError, KeyError, OverflowError: something is missing or damaged.
+    Raises OSError, ValueError, TypeError, KeyError, OverflowError: something is missing or damaged.
     """
     collision, visual = folder / f"{name}_vhacd.obj", folder / f"{name}.obj"
     x, y, z = map(float, values["inertia_diag"])

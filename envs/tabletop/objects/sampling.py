@@ -47,9 +47,8 @@ class ObjectRanges:
 class ObjectParameters:
     """One sampled object: its shape and parameters, and the pose from which it is dropped.
 
-    Attributes:
-        name: in its set. scale: factor. mass: kilograms. friction: coefficient.
-        position: (x, y, z) metres. orientation: unit quaternion (x, y, z, w).
+    `name`: in its set. `scale`: factor. `mass`: kilograms. `friction`: coefficient. `position`: (x, y, z) metres.
+    `orientation`: unit quaternion (x, y, z, w).
     """
 
     name: str
@@ -69,8 +68,7 @@ WHOLE_TABLE: Area = (((TABLE_LOW[0] + 0.1, TABLE_LOW[1] + 0.1), (TABLE_HIGH[0] -
 def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Generator) -> NDArray[np.float64]:
     """Planar positions [M, 2] in metres, one in each area, no two closer than `clearance`.
 
-    Raises:
-        NoRoomError: no arrangement was found.
+    Raises NoRoomError: no arrangement was found.
     """
     for _ in range(ATTEMPTS):
         chosen: list[NDArray[np.float64]] = []
@@ -96,11 +94,8 @@ def sample_objects(
 ) -> list[ObjectParameters]:
     """Sample one object per area, in random orientation, above the table and clear of its neighbours.
 
-    Args:
-        areas: start area of each object; the first is the target. objects: the set of the names.
-
-    Raises:
-        NoRoomError: the areas are too small for so many objects. ValueError: an unknown name.
+    `areas`: start area of each object; the first is the target. `objects`: the set of the names. Raises NoRoomError:
+    the areas are too small for so many objects. ValueError: an unknown name.
     """
     names = chosen(ranges.names, objects)
     targets = chosen(ranges.target, objects) or names

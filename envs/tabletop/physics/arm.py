@@ -49,8 +49,7 @@ class ArmDescription:
 class LoadedArm:
     """An arm's body in a simulation, and PyBullet's numbers of its parts.
 
-    Raises:
-        ValueError: PyBullet cannot read the file, or it lacks a joint or link of the description.
+    Raises ValueError: PyBullet cannot read the file, or it lacks a joint or link of the description.
     """
 
     def __init__(self, client: BulletClient, description: ArmDescription) -> None:
@@ -155,9 +154,8 @@ def _without_picture(urdf: Path) -> list[str]:
 class Forward(NamedTuple):
     """The stick's tip for some joint angles.
 
-    Attributes:
-        position: [3] metres. axis: [3] unit vector out of the stick, (0, 0, -1) where it is upright.
-        jacobian: [6, J] change of position (metres) and of orientation (radians) per radian of each joint.
+    `position`: [3] metres. `axis`: [3] unit vector out of the stick, (0, 0, -1) where it is upright. `jacobian`: [6, J]
+    change of position (metres) and of orientation (radians) per radian of each joint.
     """
 
     position: NDArray[np.float64]

@@ -37,8 +37,7 @@ ANGULAR_DAMPING = 0.5  # fraction of the angular velocity lost per second
 class Poses:
     """True poses of bodies.
 
-    Attributes:
-        positions: [M, 3] metres. orientations: [M, 4] unit quaternions (x, y, z, w).
+    `positions`: [M, 3] metres. `orientations`: [M, 4] unit quaternions (x, y, z, w).
     """
 
     positions: NDArray[np.float64]
@@ -87,8 +86,7 @@ class PhysicsWorld(Uncopied):
     def add_object(self, asset: ObjectAsset, sampled: ObjectParameters, color: Sequence[float]) -> int:
         """Add a free body; every group of its mesh file becomes one convex part of its collision shape.
 
-        Args:
-            color: red, green, blue in [0, 1].
+        `color`: red, green, blue in [0, 1].
         """
         bullet, size = self.client, [sampled.scale] * 3
         shape = {"shapeType": pybullet.GEOM_MESH, "meshScale": size}
@@ -183,9 +181,8 @@ class PhysicsWorld(Uncopied):
     def render(self, camera: Camera, *, table: bool = True) -> Rendering:
         """Depth, body numbers and colour as the camera sees them.
 
-        Args:
-            table: whether to show it. It fills most of an image and would take four fifths of the time: it is rendered
-                once per camera, and what is nearer than it is put before it.
+        `table`: whether to show it. It fills most of an image and would take four fifths of the time: it is rendered
+        once per camera, and what is nearer than it is put before it.
         """
         # The renderer omits fully transparent bodies.
         self.client.changeVisualShape(self.table, -1, rgbaColor=(*TABLE_COLOR, 0.0))

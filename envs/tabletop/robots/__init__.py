@@ -29,8 +29,7 @@ ROBOTS: dict[str, Callable[[str | Path | None], RobotFactory]] = {
 def robot_factory(robot: str | RobotFactory, assets: str | Path | None = None) -> RobotFactory:
     """The factory of the robot of that name, or the given one.
 
-    Raises:
-        ValueError: unknown robot, or missing files; the message says how to get them.
+    Raises ValueError: unknown robot, or missing files; the message says how to get them.
     """
     if not isinstance(robot, str):
         return robot

@@ -38,11 +38,7 @@ LARGEST_STEP = 0.3  # radians per iteration
 
 
 class InverseKinematics:
-    """Joint angles for positions of the tip.
-
-    Raises:
-        ValueError: the arm's file cannot be used.
-    """
+    """Joint angles for positions of the tip. Raises ValueError: the arm's file cannot be used."""
 
     def __init__(self, description: ArmDescription) -> None:
         self.forward = Kinematics(description)
@@ -107,10 +103,7 @@ class ArmRobot:
     """An arm, which waits retracted, out of the camera's view, between pushes.
 
     A push has the stick's number of physics steps and speed profile, or more steps if a joint would exceed its
-    velocity limit. All other motions are as fast as the joints allow.
-
-    Raises:
-        ValueError: the arm's file cannot be used.
+    velocity limit. All other motions are as fast as the joints allow. Raises ValueError: the arm's file cannot be used.
     """
 
     def __init__(self, world: PhysicsWorld, description: ArmDescription) -> None:

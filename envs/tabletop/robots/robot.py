@@ -94,11 +94,8 @@ SETTLING_STEPS = 20  # physics steps between two checks of the objects' speed
 def push(robot: Robot, start: NDArray[np.float64], end: NDArray[np.float64]) -> Ended:
     """Execute one push and leave the view. If the push is stopped, the tool goes up and is retracted.
 
-    Args:
-        start, end: [2] metres, where the tip touches down and where it leaves the table.
-
-    Returns:
-        Why the push ended early, "" if it did not. An unsafe or unreachable push is not begun.
+    `start`, `end`: [2] metres, where the tip touches down and where it leaves the table. Returns why the push ended
+    early, "" if it did not. An unsafe or unreachable push is not begun.
     """
     low, above, last = np.append(start, TIP_HEIGHT), np.append(start, ABOVE_HEIGHT), np.append(end, TIP_HEIGHT)
     if not robot.fits(low):

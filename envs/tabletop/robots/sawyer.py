@@ -22,8 +22,7 @@ STAND = (
 def sawyer(assets: str | Path | None = None) -> ArmDescription:
     """The Sawyer and its place: its base is the origin of all coordinates.
 
-    Raises:
-        ValueError: no folder, or it lacks the URDF or one of the meshes that the URDF names.
+    Raises ValueError: no folder, or it lacks the URDF or one of the meshes that the URDF names.
     """
     if assets is None:
         raise ValueError(f"robot sawyer needs a folder with {URDF.as_posix()}, and none was given: {HOW_TO_GET}")

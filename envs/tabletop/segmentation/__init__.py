@@ -21,8 +21,7 @@ SEGMENTERS: dict[str, Callable[..., Segmenter]] = {  # from the simulator's mask
 def segmenter_of(segmentation: str | SegmenterFactory, true_masks: TrueMasks, slots: int = OBJECT_SLOTS) -> Segmenter:
     """The segmenter of that name, or of the given factory, which finds at most `slots` objects.
 
-    Raises:
-        ValueError: unknown name.
+    Raises ValueError: unknown name.
     """
     if not isinstance(segmentation, str):
         return segmentation(slots)

@@ -150,9 +150,8 @@ ALONE = 2  # free cells, at least, around an object whose shape is stored
 class Track:
     """The last observation of an object.
 
-    Attributes:
-        region: [I, J] its cells. heights: [I, J] the map of that time.
-        shape: from when it last stood alone, at its last pose.
+    `region`: [I, J] its cells. `heights`: [I, J] the map of that time. `shape`: from when it last stood alone, at its
+    last pose.
     """
 
     region: Mask

@@ -56,11 +56,7 @@ class HeightMap:
 
 
 def map_heights(image: DepthImage) -> HeightMap:
-    """Fit the table's plane and map the heights above it.
-
-    Raises:
-        ValueError: the image shows no table.
-    """
+    """Fit the table's plane and map the heights above it. Raises ValueError: the image shows no table."""
     camera, depth = image.camera, image.depth
     plane = fit_table(image)
     along_row, along_column, column, row = camera.intrinsics
@@ -100,10 +96,7 @@ def fit_table(image: DepthImage) -> NDArray[np.float64]:
     """The plane that most of the image lies in: [3] n such that n . p = 1 for its points p in the image's axes.
 
     Repeated least squares without the points far from the last plane; the first plane is level, at the median height.
-    Objects must cover less than half of what is observed.
-
-    Raises:
-        ValueError: the image shows no table.
+    Objects must cover less than half of what is observed. Raises ValueError: the image shows no table.
     """
     camera = image.camera
     rows, columns = np.mgrid[STRIDE // 2 : camera.height : STRIDE, STRIDE // 2 : camera.width : STRIDE].reshape(2, -1)

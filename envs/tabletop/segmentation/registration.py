@@ -32,9 +32,8 @@ class Pose:
 class Shape:
     """Heights of an object's cells, and its last pose.
 
-    Attributes:
-        patch: [h, w] metres above the table; 0 outside of the object. middle: (row, column) in the patch of the
-            cell at `pose`. pose: the last observed one.
+    `patch`: [h, w] metres above the table; 0 outside of the object. `middle`: (row, column) in the patch of the cell at
+    `pose`. `pose`: the last observed one.
     """
 
     patch: NDArray[np.float32]
@@ -102,9 +101,8 @@ Table = NDArray[np.float32]
 class Arrangement:
     """Poses of shapes on a map.
 
-    Args:
-        heights: [I, J] the map, metres; 0 where nothing is to be explained.
-        shapes: those to place; initially none is placed.
+    `heights`: [I, J] the map, metres; 0 where nothing is to be explained. `shapes`: those to place; initially none is
+    placed.
     """
 
     def __init__(self, heights: NDArray[np.float32], shapes: Sequence[Shape]) -> None:

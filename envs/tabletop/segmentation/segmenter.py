@@ -24,15 +24,12 @@ class Segmenter(Protocol):
     def start(self, image: DepthImage, target: tuple[int, int] | None) -> list[Pixels]:
         """Begin an episode.
 
-        Args:
-            target: row and column of a pixel on the target, which a person confirms once; None if the target is
-                occluded, which leaves the first entry empty.
+        `target`: row and column of a pixel on the target, which a person confirms once; None if the target is occluded,
+        which leaves the first entry empty.
         """
-        ...
 
     def follow(self, image: DepthImage) -> list[Pixels]:
         """Find the same objects in the episode's next image."""
-        ...
 
 
 TrueMasks = Callable[[], Sequence[NDArray[np.bool_]]]
@@ -42,8 +39,7 @@ TrueMasks = Callable[[], Sequence[NDArray[np.bool_]]]
 class MaskSegmenter:
     """The true mask of each object, restricted to pixels with a measurement.
 
-    Args:
-        true_masks: called once per image.
+    `true_masks`: called once per image.
     """
 
     def __init__(self, true_masks: TrueMasks) -> None:

@@ -15,8 +15,7 @@ CAMERAS: dict[str, Callable[[], DepthSensor]] = {"ideal": IdealSensor, "kinect2"
 def sensor_of(camera: str | Camera | DepthSensor) -> DepthSensor:
     """The sensor of that name, an ideal one for a camera's geometry, or the given sensor.
 
-    Raises:
-        ValueError: unknown name.
+    Raises ValueError: unknown name.
     """
     if isinstance(camera, Camera):
         return IdealSensor(camera)

@@ -62,8 +62,7 @@ class Camera:
     def rays(self, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> NDArray[np.float64]:
         """Rays of pixels, in the image's axes: [P, 3] (right, down, 1), metres at a distance of one metre.
 
-        Args:
-            rows, columns: [P] pixel indices.
+        `rows`, `columns`: [P] pixel indices.
         """
         along_row, along_column, column, row = self.intrinsics
         right = (columns + RAY_COLUMN - column) / along_row
@@ -75,11 +74,8 @@ class Camera:
     ) -> NDArray[np.float64]:
         """Points in the robot's base frame at chosen pixels.
 
-        Args:
-            depth: [height, width] metres along the optical axis. rows, columns: [P] pixel indices.
-
-        Returns:
-            [P, 3] metres.
+        `depth`: [height, width] metres along the optical axis. `rows`, `columns`: [P] pixel indices. Returns [P, 3]
+        metres.
         """
         return np.array(self.position) + (self.rays(rows, columns) * depth[rows, columns][:, None]) @ self.axes
 
@@ -93,8 +89,7 @@ class Camera:
 def sample_cloud(points: NDArray[np.float64], count: int, generator: np.random.Generator) -> NDArray[np.float64]:
     """Sample `count` of the points [P, 3], each as often as any other or once more.
 
-    Raises:
-        ValueError: there is no point to sample from.
+    Raises ValueError: there is no point to sample from.
     """
     if len(points) == 0:
         raise ValueError("no point to sample a cloud from: the object is not visible")

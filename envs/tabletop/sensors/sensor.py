@@ -15,9 +15,8 @@ from cavin_pyro.envs.tabletop.sensors.camera import Camera
 class DepthImage:
     """The image of a depth camera, simulated or real.
 
-    Attributes:
-        depth: [height, width] metres along the optical axis; 0 where there is no measurement.
-        camera: the assumed camera.
+    `depth`: [height, width] metres along the optical axis; 0 where there is no measurement. `camera`: the assumed
+    camera.
     """
 
     depth: NDArray[np.floating]
@@ -44,7 +43,6 @@ class Renderer(Protocol):
 
     def __call__(self, camera: Camera, *, table: bool = True) -> Rendering:
         """Render the view of `camera`, with or without the table."""
-        ...
 
 
 @runtime_checkable
@@ -54,23 +52,16 @@ class DepthSensor(Protocol):
     @property
     def nominal(self) -> Camera:
         """The nominal camera, in whose view no robot may stand."""
-        ...
 
     def reset(self, generator: np.random.Generator) -> None:
         """Begin an episode, whose noise is all sampled from `generator`."""
-        ...
 
     def capture(self, render: Renderer) -> tuple[DepthImage, NDArray[np.int64]]:
         """Take an image; also returns the simulator's body numbers [height, width], which no real sensor has."""
-        ...
 
 
 class IdealSensor:
-    """A camera at its nominal pose, without errors.
-
-    Args:
-        camera: its pose and resolution.
-    """
+    """A camera at its nominal pose, without errors; `camera`: its pose and resolution."""
 
     def __init__(self, camera: Camera | None = None) -> None:
         self.nominal = camera or Camera()

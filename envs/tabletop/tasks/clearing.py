@@ -19,8 +19,7 @@ class Clearing(Task):
 
     A margin makes the region larger for planners, and keeps objects within reach until they have left it.
 
-    Attributes:
-        region: the tiles to clear; the target starts within.
+    `region`: the tiles to clear; the target starts within.
     """
 
     markings = (Marking("region", "to clear", "#0072B2", 0.35),)

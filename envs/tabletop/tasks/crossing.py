@@ -19,8 +19,7 @@ PUBLISHED_TOLERANCE = 1.5 * TILE_SIDE  # metres around the bridge, in real episo
 class Crossing(Task):
     """Push the target to the goal without leaving the bridge; obstacles may be anywhere.
 
-    Attributes:
-        region: the bridge. goal: the tiles of the bridge where the target must arrive.
+    `region`: the bridge. `goal`: the tiles of the bridge where the target must arrive.
     """
 
     markings = (Marking("region", "bridge", "#5A5A5A", 0.35), GOAL_MARKING)

@@ -17,8 +17,7 @@ class Gathering(Task):
 
     A margin makes the region smaller for planners, and keeps objects within reach until they have arrived.
 
-    Attributes:
-        region: the tiles that all objects have to reach; no object starts within.
+    `region`: the tiles that all objects have to reach; no object starts within.
     """
 
     markings = (Marking("region", "gather here", "#F2C200", 0.50),)

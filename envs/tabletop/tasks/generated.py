@@ -40,8 +40,7 @@ class GeneratedLayouts:
     shape: of a bridge or a region: straight, l, u, s (two turns to different sides), winding (more turns), or any, all
         equally likely; of a region also block, a rectangle.
 
-    Raises:
-        ValueError: a number out of its range, or an unknown name.
+    Raises ValueError: a number out of its range, or an unknown name.
     """
 
     tiles: int = 6
@@ -54,8 +53,7 @@ class GeneratedLayouts:
     def sample(self, what: str, by_shape: Mapping[str, Sequence[Choice]], generator: np.random.Generator) -> Choice:
         """One of the choices of the wanted shape; of any shape, all shapes that there are are equally likely.
 
-        Raises:
-            ValueError: there is none of that shape; `what` says of what.
+        Raises ValueError: there is none of that shape; `what` says of what.
         """
         there = [shape for shape in SHAPES if by_shape.get(shape)]
         if self.shape != ANY_SHAPE and self.shape not in there:

@@ -26,8 +26,7 @@ _ROWS, _COLUMNS = TILE_COUNT  # along x, away from the robot; along y
 class Insertion(Task):
     """Push the target into the slot; no object may enter the restricted region.
 
-    Attributes:
-        region: the restricted tiles. goal: the slot.
+    `region`: the restricted tiles. `goal`: the slot.
     """
 
     markings = (Marking("region", "keep out", "#C2272D", 0.40), GOAL_MARKING)

@@ -24,10 +24,8 @@ Moves = Sequence[tuple[int, int, Mask]]
 def check_reach(task: Task) -> None:
     """Check that pushes along x and y can bring an object, alone on the table, from every start tile to the goal.
 
-    A task with a goal for each object passes.
-
-    Raises:
-        ValueError: from a start tile they cannot; it is named, and so is the tile where pushes end.
+    A task with a goal for each object passes. Raises ValueError: from a start tile they cannot; it is named, and so is
+    the tile where pushes end.
     """
     if not task.goal_is_shared:
         return

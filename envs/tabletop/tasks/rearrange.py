@@ -57,8 +57,7 @@ class Rearrange(Task):
     def of_episode(self, observation: Observation, generator: np.random.Generator) -> Task:
         """This task with the places of an episode.
 
-        Raises:
-            ValueError: there are more or fewer places than objects, or no room for random ones.
+        Raises ValueError: there are more or fewer places than objects, or no room for random ones.
         """
         objects = int(observation.mask.sum())
         if not self.places:
@@ -104,8 +103,7 @@ def sample_places(
 ) -> tuple[Place, ...]:
     """Places (x, y) in metres, uniform on some tiles, no two closer than `clearance` metres.
 
-    Raises:
-        ValueError: the region is too small for so many.
+    Raises ValueError: the region is too small for so many.
     """
     half = TILE_SIDE / 2
     centers = [tile_center(tile) for tile in region]
@@ -121,11 +119,7 @@ def sample_places(
 
 
 def _places(given: Any) -> tuple[Place, ...]:
-    """Check places from Python or YAML.
-
-    Raises:
-        ValueError: they are no points on the table, or too many.
-    """
+    """Check places from Python or YAML. Raises ValueError: they are no points on the table, or too many."""
     try:
         points = np.array(given, dtype=np.float64).reshape(len(given), 2)
     except (TypeError, ValueError) as error:

@@ -26,9 +26,8 @@ CRITERIA = ("strict", "published")
 class Outcome(NamedTuple):
     """The outcome of one step of a task; every tensor is [...].
 
-    Attributes:
-        reward: the sum of the terms. terms: by name, see `Task.terms`.
-        success, violation, fall: bool, at most one is true.
+    `reward`: the sum of the terms. `terms`: by name, see `Task.terms`. `success`, `violation`, `fall`: bool, at most
+    one is true.
     """
 
     reward: Tensor
@@ -92,8 +91,7 @@ class TaskReward:
             those of the published implementation for real episodes (`Task.published_violation`).
         device: where the layout's numbers lie, best that of the tensors to evaluate.
 
-    Raises:
-        ValueError: unknown kind of reward, unknown criterion, or a negative margin.
+    Raises ValueError: unknown kind of reward, unknown criterion, or a negative margin.
     """
 
     reads_features = False
@@ -129,9 +127,8 @@ class TaskReward:
     def along(self, states: Tensor, mask: Tensor, *, fallen: bool = False) -> Outcome:
         """Evaluate all T steps of paths, equal to one call per step, but faster: [..., T].
 
-        Args:
-            states: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target.
-            mask: [..., M] bool, True for real objects. fallen: as for one step.
+        `states`: [..., T + 1, M, 3] metres, the state before the first step included; object 0 is the target. `mask`:
+        [..., M] bool, True for real objects. `fallen`: as for one step.
         """
         step = Step(states[..., :2], mask.unsqueeze(-2), self.margin)
         fall = step.any_enters(lambda points: -table_distance(points))

@@ -37,9 +37,8 @@ class Step(NamedTuple):
     A task evaluates all T steps at once: [..., T]. The environment evaluates T = 1 step at a time, planners whole
     segments, so that no state is evaluated twice.
 
-    Attributes:
-        states: [..., T + 1, M, 2] metres. mask: [..., 1, M] bool, True for real objects.
-        margin: safety margin in metres, for planners; else 0.
+    `states`: [..., T + 1, M, 2] metres. `mask`: [..., 1, M] bool, True for real objects. `margin`: safety margin in
+    metres, for planners; else 0.
     """
 
     states: Tensor
@@ -77,8 +76,7 @@ class Step(NamedTuple):
 
         By more than `STILL`: predictions of an object that nothing touches differ by less. What lies there may stay.
 
-        Args:
-            arrived: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
+        `arrived`: whether objects at points [..., M, 2] have arrived, where it does not matter: [..., M] bool.
         """
         depths = torch.where(arrived(self.states), -torch.inf, -box_distance(self.states, REACH_LOW, REACH_HIGH))
         before, after = depths[..., :-1, :], depths[..., 1:, :]
@@ -134,8 +132,7 @@ class Task(ABC):
         movable: the field with the goal's tiles, which a person may move during an episode; "": none.
         target_start, obstacle_start: tiles on which objects start.
 
-    Raises:
-        ValueError: a tile is malformed, listed twice or off the table, or tiles contradict one another.
+    Raises ValueError: a tile is malformed, listed twice or off the table, or tiles contradict one another.
     """
 
     name: ClassVar[str]
@@ -196,15 +193,13 @@ class Task(ABC):
     def potential(self, positions: Tensor, mask: Tensor) -> Tensor:
         """Minus the remaining distance in metres: [...]; its increase over a step is the dense reward's `progress`.
 
-        Args:
-            positions: [..., M, 2] metres. mask: [..., M] bool, True for real objects.
+        `positions`: [..., M, 2] metres. `mask`: [..., M] bool, True for real objects.
         """
 
     def terms(self, step: Step, success: Tensor, failure: Tensor, *, dense: bool) -> dict[str, Tensor]:
         """The reward's terms by name, each [...]; the reward is their sum.
 
-        Args:
-            success, failure: [...] bool, at most one of them true.
+        `success`, `failure`: [...] bool, at most one of them true.
         """
         progress = torch.zeros_like(step.target[..., 0])
         if dense:
@@ -222,8 +217,7 @@ class Task(ABC):
         The environment calls it with every scene that may become an episode, and the planner's reward is that of the
         returned task.
 
-        Args:
-            observation: the episode's first. generator: for the goal alone, so that scenes do not depend on the task.
+        `observation`: the episode's first. `generator`: for the goal alone, so that scenes do not depend on the task.
         """
         return self
 
@@ -235,8 +229,7 @@ class Task(ABC):
     def moved(self: Self, goals: NDArray[np.float64], target: Place) -> Self:
         """This task with its goal moved during an episode, by whole tiles; `target`: where the target is.
 
-        Raises:
-            ValueError: tiles would be off the table, or contradict others.
+        Raises ValueError: tiles would be off the table, or contradict others.
         """
         if not self.movable:
             raise ValueError(f"the goal of {self.name} cannot be moved")
@@ -263,8 +256,7 @@ class Task(ABC):
     def generate(cls, wanted: GeneratedLayouts, generator: np.random.Generator) -> Task:
         """The task in a new layout as `wanted`, for `layout=generated`; by default there are none.
 
-        Raises:
-            ValueError: there is no such layout.
+        Raises ValueError: there is no such layout.
         """
         raise ValueError(f"task {cls.name} has no generated layouts: give another layout, or another task")
 
@@ -307,8 +299,7 @@ def check_inside(inner: Iterable[Tile], outer: Iterable[Tile], problem: str) -> 
 def check_functions(task: Task, objects: int) -> None:
     """Call the functions of a task once, on a few plans with that number of objects.
 
-    Raises:
-        ValueError: one returns another type or shape than `Task` documents.
+    Raises ValueError: one returns another type or shape than `Task` documents.
     """
     plans, steps = 8, 6  # other than one another and than any number of objects: no wrong shape fits by chance
     states, mask = torch.zeros(plans, steps + 1, objects, 2), torch.ones(plans, 1, objects, dtype=torch.bool)

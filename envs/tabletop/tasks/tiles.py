@@ -17,8 +17,7 @@ from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW, TILE_COUNT
 class TileSet:
     """A union of tiles with an exact signed distance. Equal if the tiles and their order are.
 
-    Args:
-        tiles: may be empty, but then no distance is defined.
+    `tiles`: may be empty, but then no distance is defined.
     """
 
     def __init__(self, tiles: Iterable[Tile]) -> None:
@@ -162,8 +161,8 @@ def box_distance(points: Tensor, lows: Sequence[float], highs: Sequence[float]) 
 def parse_tiles(value: Any, name: str) -> tuple[Tile, ...]:
     """Check a list of tiles from Python or YAML.
 
-    Raises:
-        ValueError: it is no list, or a tile is malformed, listed twice or off the table; `name` says which list it is.
+    Raises ValueError: it is no list, or a tile is malformed, listed twice or off the table; `name` says which list it
+    is.
     """
     if isinstance(value, TileSet):
         value = value.tiles
@@ -198,8 +197,7 @@ class DistanceField:
     From a point that is not allowed, or without such a path, it is the length of the shortest path that also crosses
     forbidden places. Between the points of the grid it is bilinear. Without a goal point it is 0 everywhere.
 
-    Args:
-        allowed, goal: which points of the `grid()` are, [rows, columns] bool.
+    `allowed`, `goal`: which points of the `grid()` are, [rows, columns] bool.
 
     Attributes:
         longest: metres, an upper bound on all lengths.

@@ -97,8 +97,7 @@ class ContactDynamics(Outcome):
             reach_margin: metres by which a push may pass an object that it can move; None computes all objects.
             equivariant: whether f is equivariant to turns and shifts of the table.
 
-        Raises:
-            ValueError: another world, features that are no outlines, or a negative margin.
+        Raises ValueError: another world, features that are no outlines, or a negative margin.
         """
         if space is not None and (space.positions, space.action_names) != PUSHES:
             raise ValueError("dynamics=contact is for pushes on a table: choose dynamics=paper")

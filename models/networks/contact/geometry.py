@@ -63,14 +63,12 @@ class ToolContact(nn.Module):
 
         Components come first, so that loops run over candidates.
 
-        Args:
-            along, across: `[...]` metres, the object's centre from the push's start.
-            outline: `[2 K + 1, ...]`, in the push's frame. length: metres, of the push; broadcasts to `[...]`.
+        `along`, `across`: `[...]` metres, the object's centre from the push's start. `outline`: `[2 K + 1, ...]`, in
+        the push's frame. `length`: metres, of the push; broadcasts to `[...]`.
 
-        Returns:
-            `[MEASURES, ...]`: the way until the tool enters; the chord that it would cut, negative if it passes
-            beside; the way that is left then, and the same if it hits at all; the normal of the side that it meets
-            (x, y) and its y if it hits at all; the distance from the start to the object, negative inside.
+        Returns `[MEASURES, ...]`: the way until the tool enters; the chord that it would cut, negative if it passes
+        beside; the way that is left then, and the same if it hits at all; the normal of the side that it meets (x, y)
+        and its y if it hits at all; the distance from the start to the object, negative inside.
         """
         outline = outline.expand(-1, *along.shape)
         extents = (self.extents @ outline.flatten(1)).unflatten(1, along.shape) + TOOL_RADIUS
@@ -120,10 +118,9 @@ def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, 
         aim: `[2, R]` vectors of any length. carried: `[R]` metres along the aim, 0 without contact.
         rows, pairs: tell which objects these are.
 
-    Returns:
-        `[PAIR_MEASURES, P]` of object i and another j, in units of `DISPLACEMENT_UNIT`: where i is, seen from
-        j, and where j would push it; if j were carried: the way until it meets i, the gap between them across the aim,
-        how far it would push i; the same three for i and j exchanged; how far both are carried.
+    Returns `[PAIR_MEASURES, P]` of object i and another j, in units of `DISPLACEMENT_UNIT`: where i is, seen from j,
+    and where j would push it; if j were carried: the way until it meets i, the gap between them across the aim, how far
+    it would push i; the same three for i and j exchanged; how far both are carried.
     """
     cosines, sines = multiples(*aim)
     sizes = 2, PER_OUTLINE, HARMONICS, HARMONICS, 1
@@ -152,9 +149,8 @@ def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, marg
     An object that the tool meets is taken for a disc that is carried along the push for the rest of its way. Objects
     that such objects push are not asked what they push.
 
-    Args:
-        along, across: `[M, ...]` metres, centres from the push's start, in its axes. length: `[...]` metres, of the
-            push; broadcasts to `[M, ...]`. radius: `[M, ...]` metres, mean extent of the objects. margin: metres.
+    `along`, `across`: `[M, ...]` metres, centres from the push's start, in its axes. `length`: `[...]` metres, of the
+    push; broadcasts to `[M, ...]`. `radius`: `[M, ...]` metres, mean extent of the objects. `margin`: metres.
     """
     met = _squared_distance(along, across, length) < (radius + (TOOL_RADIUS + margin)).square()
     if len(along) == 1:

@@ -39,7 +39,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
     ("train", "objective.elbo._target_=builtins.dict", "must be an ELBO of Pyro, such as Trace_ELBO, not dict"),
     ("check", "sizes.subgoals=3 sections=[subgoals]", "sizes.subgoals=3: Cannot assign int to dict"),
-    ("check", "checkpoint=@checkpoint", "does not tell which windows its training held out (KeyError: 'windows')"),
+    ("check", "checkpoint=@checkpoint", "its training held out (ValueError: its windows are of no dataset)"),
     ("check", "checkpoint=@far_scale", "far_scale: scales.center must be a number of at least 1e-12 and at most 1e+12"),
     ("train", "data=@nothing", "python -m cavin_pyro.collect"),
     ("train", "data=@corrupt_data", "corrupt_data/episodes-00001.h5 is missing or corrupt"),

@@ -164,16 +164,8 @@ def test_packages_of_the_users_own_do_not_disturb_a_command(tmp_path: Path) -> N
         (tmp_path / name / "__init__.py").write_text("raise AssertionError")
     for name in ("planning", "envs"):
         (tmp_path / f"{name}.py").write_text("raise AssertionError")
-    names = [
-        "plan",
-        "train",
-        "planning.cavin",
-        "planning.optimizers",
-        "envs.tabletop.tasks",
-        "guides.cascaded",
-        "models.flat",
-    ]
-    program = "\n".join(f"import cavin_pyro.{name}" for name in names)
+    names = "plan train planning.cavin planning.optimizers envs.tabletop.tasks guides.cascaded models.flat"
+    program = "\n".join(f"import cavin_pyro.{name}" for name in names.split())
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     command, environment = [sys.executable, "-c", program], {**os.environ, "PYTHONPATH": path}
     subprocess.run(command, cwd=tmp_path, env=environment, check=True)

@@ -52,7 +52,7 @@ def test_help_lists_the_usual_options_or_every_one_with_its_meaning_and_valid_ex
     usual = help_page(command, "What it does.", config, choices, everything=False)
     assert all(map(is_usual, names := re.findall(r"^  ([^-\s]\S*?)=", usual, re.MULTILINE))) and len(names) <= 25
     page = help_page(command, "What it does.", config, choices)
-    assert 10 < len(names) < page.count("\n  ")
+    assert 4 < len(names) < page.count("\n  ")
     listed = {line.strip().partition("=")[0] for line in page.splitlines() if "=" in line and line[2:3] > " "}
     hidden = {f"planner.{name}" for name in FACTS_OF_PRESETS} | {"model.prior._target_"}
     assert {
@@ -93,26 +93,22 @@ def test_a_composition_leaves_nothing_behind(command: str) -> None:
 
 BAD = [  # overrides of `plan` unless another command is named, and what the line must say
     ("task=[crossing,clearing]", "task=[crossing,clearing]: task takes one choice, not a list"),
-    ("margin=0.07500001", "not 0.07500001"),
     ("train planner.samples=3", "unknown option 'planner.samples': it is an option of plan, evaluate; valid are"),
     ("collect env=pusht env.camera=kinect2", "unknown option 'env.camera': "),
     ("task=juggling", "unknown task 'juggling': choose from clearing, "),
     ("planner.optimizer=best", "unknown planner/optimizer 'best': choose from cem, "),
     ("planner.optimizer=my_lab.Mine", "a class of your own is planner.optimizer._target_=my_lab.Mine"),
-    ("train guide=nonsense", "unknown guide 'nonsense': choose from "),
     ("reward=medium", "unknown reward 'medium': choose from dense, sparse"),
     ("tsak=crossing", "unknown option 'tsak': did you mean task? valid are checkpoint, "),
     ("planner.sampels=3", "unknown option 'planner.sampels': did you mean samples? valid under planner are "),
     ("sum.what.else=3", "unknown option 'sum.what.else': valid are "),
     ("check device=cuda", "unknown option 'device': it is an option of pretrain, "),
     ("+unknown=1", "unknown option 'unknown': valid are "),
-    ("++env.ranges.clearnace=1", "unknown option 'env.ranges.clearnace': did you mean clearance? "),
     ("~task", "~task: an option cannot be removed"),
     ("hydra.run.dir=here", "hydra.run.dir=here: Hydra's folders and logs are not used here; choose output=DIR"),
     ("reproduce objects=[]", "objects must name at least one: choose from 1, 2, 3, 4, 5"),
     ("seed", "seed: missing EQUAL at '<EOF>'; write name=value, or "),
     ("train data=[ü]", "; write name=value, or 'name=\"value\"'"),
-    ("seed=[1,", "seed=[1,: "),
     ("seed=1,2", "seed=1,2: Ambiguous value for argument 'seed=1,2'; several values need -m: "),
     ("reward=???", "reward=???: Missing mandatory value"),
     ("reward=${nowhere}", "reward=${nowhere}: Interpolation key 'nowhere' not found"),
@@ -122,15 +118,13 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("trust=os", "trust=os: Invalid value assigned: str is not a ListConfig, list or tuple"),
     ("train guide=[]", "guide must be one of auto_iaf, "),
     ("train objective=[1,2]", "; choose from counterfactual, iwae, "),
-    ("train objective.elbo.num_particles=nan", "objective.elbo.num_particles=nan: Value 'nan'"),
     ("train windows.held_out_objects=[[]]", "windows.held_out_objects must be a plain list such as [a,b], not [[]]"),
     ("video=${oc.decode:'maybe'}", "'maybe' is not a valid bool"),
     (f"seed={'1' * 5000}", "value has 5000 digits"),
     ("seed=${oc.decode:'-1'}", "seed must be a whole number of at least 0 and at most 4294967295, not -1"),
     ("margin=inf", "margin in metres must be a number of at least 0 and at most 0.075, not inf"),
-    ("evaluate workers=0", "workers must be a whole number of at least 1 and at most 1024, not 0"),
     ("train trainer.learning_rate=0", "trainer.learning_rate must be a number above 0 and at most 1e+30, not 0"),
-    ("pln seed=0", "unknown command 'pln': choose from collect, "),
+    ("pln seed=0", "unknown command 'pln': choose from quickstart, "),
 ]
 
 
@@ -159,9 +153,8 @@ def test_the_planner_brings_its_checkpoint(overrides: str, name: str) -> None:
 def test_checkpoints_have_names() -> None:
     assert find_checkpoint("kinect").is_file()
     assert find_checkpoint("runs/a.safetensors") == Path("runs/a.safetensors")
-    for name, said in (("best", "^unknown checkpoint 'best': choose from cavin, "), (None, "is no NoneType$")):
-        with pytest.raises(UserError, match=said):
-            find_checkpoint(name)
+    with pytest.raises(UserError, match="^unknown checkpoint 'best': choose from cavin, "):
+        find_checkpoint("best")
     for model, guide in CHECKPOINTS.values():
         compose("train", f"model={model}", f"guide={guide}")
 

@@ -5,24 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from omegaconf import OmegaConf
 
-from cavin_pyro.config.composition import PRESETS, compose
+from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.world import object_ranges, task_of
 from cavin_pyro.envs.tabletop.objects.sampling import ObjectRanges
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
-from cavin_pyro.envs.tabletop.tasks import TASKS
 from cavin_pyro.envs.tabletop.tasks.insertion import Insertion
 
 PUBLISHED = ObjectRanges(mass=(1.0, 1.0), kilograms=(10.0, 10.0), friction=(0.8, 0.8), target=("mug",), drop_height=0.2)
-
-
-def test_every_task_can_be_chosen_by_its_name() -> None:
-    assert {file.stem for file in (PRESETS / "task").iterdir()} == set(TASKS)
-    for name, task in TASKS.items():
-        assert task_of(compose("plan", f"task={name}"))[0] is task
-        assert task_of(OmegaConf.create({"task": name, "tiles": {}})) == (task, {})
 
 
 def test_options_of_a_task_and_tiles_replace_fields_of_its_layout() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 
 from cavin_pyro.data.__main__ import main
 from cavin_pyro.data.dataset import Arrays, write_metadata, write_shard
+from tests.cavin_pyro.conftest import ended
 
 STEPS, OBJECTS = 5, 2
 
@@ -18,18 +18,7 @@ STEPS, OBJECTS = 5, 2
 @pytest.fixture
 def data(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Run the command; returns its exit status, output and errors without progress bars."""
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["data", *map(str, arguments)])
-        status = 0
-        try:
-            main()
-        except SystemExit as stop:
-            status = int(stop.code or 0)
-        output, errors = capsys.readouterr()
-        return status, output, "\n".join(line for line in errors.splitlines() if line.startswith("error:"))
-
-    return run
+    return lambda *arguments: ended(main, ["data", *arguments], monkeypatch, capsys)
 
 
 def made_up_episodes(count: int = 12, first: int = 3) -> Arrays:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import shutil
-import sys
 import tarfile
 import threading
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from cavin_pyro.envs.tabletop.robots.robot import STICK_LENGTH
 from cavin_pyro.fetching.meshes import closed, convex_parts
 from cavin_pyro.fetching.sawyer import COMMIT, PACKAGE, SawyerRobot
 from cavin_pyro.fetching.ycb import SCANS, YcbObjects
+from tests.cavin_pyro.conftest import ended
 
 pytest.importorskip("pooch", reason="pooch is not installed: it comes with the extras assets and test")
 
@@ -92,16 +92,10 @@ def assets(site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
     """Run the command into `tmp_path/assets`: exit status, and its line of output or of the error."""
 
     def run(kind: str, source: str = site.address) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["assets", kind, "--to", str(tmp_path / "assets"), "--source", source])
-        status = 0
-        try:
-            main()
-        except SystemExit as stopped:
-            status = int(stopped.code or 0)
-        output, errors = capsys.readouterr()
-        complaints = [line for line in errors.splitlines() if line.startswith("error: ")]
-        assert len(complaints) == (status != 0) and "Traceback" not in errors
-        return status, "".join(complaints) or output.strip()
+        words = ["assets", kind, "--to", tmp_path / "assets", "--source", source]
+        status, output, complaint = ended(main, words, monkeypatch, capsys)
+        assert (complaint != "") == (status != 0) and "\n" not in complaint
+        return status, complaint or output.strip()
 
     return run
 

@@ -83,7 +83,6 @@ def test_parts_that_are_not_trained_stay_bit_for_bit(folder: Path) -> None:
         (["trainer.reflect=true"], "those of PointNet have none: pass geometry=outline, or leave trainer.reflect"),
         (["geometry=outline", "trainer.reflect=true", "guide=auto_normal"], "trainer.reflect needs a guide that"),
         (["guide=auto_normal", "objective=mean_field_elbo"], "samples auxiliary sites, which this objective leaves"),
-        (["guide=auto_normal", "objective.warm_up_steps=5"], "without objective.kl_weights and"),
     ],
 )
 def test_what_cannot_be_trained_gives_its_line_and_writes_nothing(folder: Path, options: list, said: str) -> None:

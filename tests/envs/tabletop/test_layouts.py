@@ -66,7 +66,6 @@ def test_a_layout_is_read_from_a_file(tmp_path: Path, kind: type) -> None:
         ("crossing", {"goal": [[2.0, 2]]}, r"goal: a tile is two whole numbers such as \[2, 3\], not \[2.0, 2\]"),
         ("crossing", {"bridge": [[2, 2]]}, r"unknown key 'bridge', valid keys are task, region, goal, target_start"),
         ("crossing", {"goal": [[2, 4]]}, r"tile \[2, 4\] is both goal and target_start"),
-        ("crossing", {"goal": [[3, 2]]}, r"goal tile \[3, 2\] is off the bridge, add it to region"),
         ("insertion", {"region": [[1, 3]]}, r"obstacle_start tile \[1, 3\] overlaps the restricted region"),
         ("clearing", {"task": "crossing"}, r"is for task crossing: run it with task=crossing$"),
         ("crossing", {"task": "juggling"}, r"unknown task 'juggling', choose from clearing, crossing, "),
@@ -93,7 +92,7 @@ def test_files_that_are_no_layout_get_one_line(tmp_path: Path) -> None:
     for layout in ("nowhere.yaml", -1, tmp_path):
         with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, random, generated or the path"):
             load_task("crossing", layout)
-    with pytest.raises(ValueError, match=r"crossing_0\.yaml with overrides: goal tile \[4, 6\] is off the bridge"):
+    with pytest.raises(ValueError, match=r"crossing_0\.yaml with overrides: goal tile \[4, 6\] is off the bridge, add"):
         load_task("crossing", 0, {"goal": [[4, 6]]})
     with pytest.raises(ValueError, match=r"^tiles replace fields of one layout: give layout=0, 1, 2 or a YAML file"):
         possible_tasks("insertion", "random", {"goal": [[2, 1]]})
@@ -295,8 +294,7 @@ def test_fields_with_defaults_may_be_left_out_of_a_layout_and_options_may_be_in_
 
 
 def test_a_reward_is_the_sum_of_its_named_terms(tmp_path: Path) -> None:
-    path = tmp_path / "visit.yaml"
-    path.write_text(yaml.safe_dump({"places": [[0, 0]], "shunned": [[4, 6]], **STARTS}))
+    path = write(tmp_path, {"places": [[0, 0]], "shunned": [[4, 6]], **STARTS})
     env = PushingEnv(task=Visit, layout=path, tiles={"bonus": 0.25}, objects=2)
     env.reset(seed=0)
     _, reward, *_, info = env.step(np.zeros(4, np.float32))

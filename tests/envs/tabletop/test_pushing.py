@@ -24,13 +24,9 @@ from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW, normalised
 
 NOTHING = np.array([-1.0, -1.0, 0.0, 0.0], dtype=np.float32)  # in a corner where no builtin task starts objects
 LYING_ALONG_Y = (-0.5, -0.5, -0.5, 0.5)
-TILES = {
-    "region": [[2, 2], [2, 3], [2, 4]],
-    "goal": [[2, 2]],
-    "target_start": [[2, 4]],
-    "obstacle_start": [[1, 3], [3, 3]],
-}
-BRIDGE = Crossing(**TILES)
+BRIDGE = Crossing(
+    region=[(2, 2), (2, 3), (2, 4)], goal=[(2, 2)], target_start=[(2, 4)], obstacle_start=[(1, 3), (3, 3)]
+)
 Make = Callable[..., PushingEnv]
 
 
