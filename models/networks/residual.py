@@ -34,7 +34,7 @@ class ResidualDynamics(Outcome):
     def __init__(
         self, space: Space, *, feature_dimension: int = 64, width: int = 64, hidden: int = 256, depth: int = 3
     ) -> None:
-        """The layers; `hidden`: their width. `width`: of the state encoder, which f does not read."""
+        """`hidden`: width of the layers. `depth`: number of residual layers. `width`: of the encoder, which f omits."""
         super().__init__()
         self.space, self.parts = space, (space.positions, feature_dimension)
         inputs = space.inputs + 2 * OCTAVES * space.positions + feature_dimension
