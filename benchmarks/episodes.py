@@ -87,7 +87,6 @@ SUCCESS = [
     *of_each_task("Algorithm 1, 3 objects", *PAPER, "env.segmentation=clusters", "criterion=published"),
     *of_each_task("Algorithm 1, 5 objects", *PAPER, objects=5),
     *of_each_task("script without a model, 3 objects", "planner=scripted"),
-    *of_each_task("script without a model, 5 objects", "planner=scripted", objects=5),
     *of_each_task("random pushes", "planner=random"),
     *(row for seed in range(3) for row in of_each_task(f"quickstart, seed {seed}", MADE.format(seed))),
 ]
