@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import gymnasium
@@ -27,10 +27,20 @@ Geometry = Callable[[Tensor], Tensor]
 
 def finite_numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
     """Values of one of these lengths, such as an action; a ValueError if they are others, or one is not finite."""
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
     if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
         raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
     return array
+
+
+def known_options(options: Mapping[str, Any] | None, *names: str) -> Mapping[str, Any]:
+    """The options of a reset, `{}` for None; a ValueError if one has another name."""
+    if unknown := sorted(set(options or {}) - set(names)):
+        raise ValueError(f"unknown option {unknown[0]!r} of reset: choose from {', '.join(names)}")
+    return options or {}
 
 
 class Policy(Protocol):

@@ -129,7 +129,8 @@ def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[st
 def _line(error: Exception, words: Sequence[str]) -> str | None:
     """What to say of an error instead of a traceback; None for a bug."""
     if isinstance(error, UserError):
-        said, sections = str(error), {section.partition(".")[0] for section in error.sections}
+        said = f"{error}{'; --traceback shows where' if error.unclear else ''}"
+        sections = {section.partition(".")[0] for section in error.sections}
         given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in sections]
         about, places = given if error.__cause__ else [], dict[int, str]()
         for key, _, value in (word.lstrip("+").partition("=") for word in given):

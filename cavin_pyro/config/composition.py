@@ -10,6 +10,7 @@ import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
+from numbers import Number
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,9 @@ def _word(value: Any) -> str:
         return f"[{','.join(map(_word, value))}]"
     if value is None or isinstance(value, bool | int | float):
         return shown(value) if value is None or isinstance(value, bool) else str(value)
+    if not isinstance(value, str | os.PathLike | Number):
+        said = f"an option is a name, a number, a list or a section, not an object of {type(value).__name__}"
+        raise UserError(f"{said}: fit and rollout take objects")
     plain = re.fullmatch(r"(?!(null|true|false|nan|inf)$)[a-z_][\w./-]*", str(value), re.IGNORECASE)
     return str(value) if plain else QuotedString(str(value), Quote.single).with_quotes()
 
@@ -273,6 +277,9 @@ def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
     if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
         return _unknown(name, key, known)
     first = str(error.__cause__ or error).splitlines()[0]
+    if first.startswith("Could not override") and "/" in key:
+        section, _, part = key.rpartition("/")
+        return f"{word}: the chosen {section} has no {part}: leave it out, or choose another {section}"
     if choices := presets(key.replace(".", "/")):
         first += f"; choose from {', '.join(choices)}"
     if first.startswith("Ambiguous value"):

@@ -14,10 +14,12 @@ class UserError(Exception):
     """Bad input, with its place and the valid choices: one line, shown without a traceback.
 
     `sections`: beginnings of options' names, of which the command line's head the line where it names none itself.
+    `unclear`: whether it says what somebody else's exception does; a command adds that --traceback shows where.
     """
 
     status = 2  # of the command
     sections: tuple[str, ...] = ()
+    unclear = False
 
 
 class WorkerError(UserError):
@@ -36,17 +38,21 @@ def user_input(*sections: str, where: str = "") -> Iterator[None]:
     try:
         yield
     except UserError as error:
-        if where:
-            raise UserError(f"{where}: {error}") from error
+        error.args = (f"{where and f'{where}: '}{error}",)
         error.sections = error.sections or sections
         raise
     except (Exception, SystemExit) as error:  # the user's modules may end the program
         if isinstance(error, OSError) and error.errno is not None:  # `guarded` says what a disk refuses
             raise
-        kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
-        refused = UserError(f"{where and f'{where}: '}{kind}{one_line(error)}{kind and '; --traceback shows where'}")
-        refused.sections = sections
-        raise refused from error
+        raise refused(error, where, sections) from error
+
+
+def refused(error: BaseException, where: str = "", sections: tuple[str, ...] = ()) -> UserError:
+    """An exception of somebody else's as a `UserError`."""
+    kind = "" if isinstance(error, ValueError) or lacks_memory(error) else f"{type(error).__name__}: "
+    made = UserError(f"{where and f'{where}: '}{kind}{one_line(error)}")
+    made.sections, made.unclear = sections, bool(kind)
+    return made
 
 
 def lacks_memory(error: BaseException) -> bool:

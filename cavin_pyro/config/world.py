@@ -19,12 +19,6 @@ from cavin_pyro.envs.tabletop.robots import robot_factory
 from cavin_pyro.envs.tabletop.tasks import Task
 from cavin_pyro.envs.world import World, check_world
 
-LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
-    "scale": (0.1, 10.0),
-    "mass": (0.001, 1000.0),
-    "friction": (0.001, 10.0),
-    "kilograms": (0.001, 1000.0),
-}
 Named = str | Mapping[str, Any] | DictConfig
 """The value of an option: a name of ours, or a section with `_target_`, a class of the user's, and its options."""
 
@@ -59,7 +53,7 @@ def world_of(config: Mapping[str, Any] | DictConfig) -> World | None:
 
 
 def object_ranges(env: DictConfig) -> ObjectRanges:
-    """Object parameters' ranges; an unknown object, or a range outside of `LIMITS`, is a `UserError`."""
+    """Object parameters' ranges; an unknown object, or a range out of its limits, is a `UserError`."""
     ranges: Any = OmegaConf.to_container(env.ranges)
     objects = part_of("objects", env.objects, env.assets)
     every = tuple(dict.fromkeys(map(plain_name, objects.names)))
@@ -69,12 +63,8 @@ def object_ranges(env: DictConfig) -> ObjectRanges:
         ranges[name] = tuple(ranges[name] or usual)
         with user_input(where=f"env.ranges.{name}"):
             chosen(ranges[name], objects)
-    for name, (least, most) in LIMITS.items():
-        if (given := ranges[name]) is not None:
-            if len(given) != 2 or not least <= given[0] <= given[1] <= most:
-                raise UserError(f"env.ranges.{name} must be low and high, from {least:g} to {most:g}, not {given}")
-            ranges[name] = tuple(given)
-    return ObjectRanges(**ranges)
+    with user_input("env"):
+        return ObjectRanges(**ranges)
 
 
 def part_of(name: str, value: Named, assets: str | Path | None = None) -> Any:

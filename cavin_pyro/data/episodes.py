@@ -106,6 +106,11 @@ def checked_episode(
     if (largest := float(motions.abs().max())) > 1:
         raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
+    steps = float(places.diff(dim=0).abs().amax((1, 2)).median())
+    if steps > space.step_range:
+        raise UserError(
+            f"most steps move something by {steps:g} or more, beyond step_range={space.step_range:g}: same unit?"
+        )
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
     real = checked("mask", mask, torch.bool, places.shape[1:2])
     if not real.any():

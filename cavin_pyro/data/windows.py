@@ -112,6 +112,8 @@ class WindowTable:
             check_number("validation_fraction", validation_fraction, high=0.99, positive=True)
             check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
             parts = [centers, features, actions, [None] * len(actions) if mask is None else mask]
+            if not all(hasattr(part, "__len__") for part in parts):
+                raise UserError("centers, features, actions and mask must be lists or arrays")
             if not isinstance(space, Space) or len({*map(len, parts)}) > 1:
                 given = f"{type(space).__name__} and {', '.join(str(len(part)) for part in parts)}"
                 raise UserError(f"give a Space, and as many centers, features, actions and masks, not {given}")
@@ -225,6 +227,8 @@ def load_windows(
     for name in ("maximum_step", "minimum_move", "maximum_move") if space else ():
         if getattr(config, name) != getattr(WindowConfig, name):
             raise UserError(f"windows.{name} is of the tabletop; elsewhere the space's scales say what moves: leave it")
+    if config.minimum_move >= config.maximum_move:
+        raise UserError(f"windows.minimum_move must be below windows.maximum_move={config.maximum_move:g}")
     fingerprint = "" if geometry is None else geometry_fingerprint(geometry)
     dataset.check_distinct(folders)
     excluded = find_held_out(config.held_out_objects, folders, option="windows.held_out_objects")

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from cavin_pyro.config.device import choose_device
-from cavin_pyro.config.errors import UserError, one_line, user_input
+from cavin_pyro.config.errors import UserError, refused, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
@@ -272,10 +272,7 @@ def refusals(seed: int, part: World | Planner) -> Iterator[None]:
         ours = all(type(one).__module__.partition(".")[0] in known for one in _parts(part))
         if ours or isinstance(error, UserError):
             raise
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        refused = UserError(f"{kind}{one_line(error)}{kind and '; --traceback shows where'}")
-        refused.sections = ("env", "planner", "task")
-        raise refused from error
+        raise refused(error, f"{type(part).__name__}, seed={seed}", ("env", "planner", "task")) from error
 
 
 def _parts(part: Any) -> Iterator[Any]:

@@ -162,8 +162,8 @@ def save(
         raise UserError(f"{wrong[0]} must be a Module, not {type(others[wrong[0]]).__name__}")
     if all(part is None for part in parts.values()) or (guide is not None and model is None):
         raise UserError(f"save needs {'a part' if guide is None else 'the model of this guide'}: give model=")
-    if not Path(path).parent.is_dir():
-        raise UserError(f"there is no folder for {path}: make it, or give another path")
+    if not Path(path).parent.is_dir() or Path(path).is_dir():
+        raise UserError(f"{path} is a folder, or has none: make that, or give another path, FILE.safetensors")
     stored = dict(config or {})
     if model is not None and "model" not in stored:
         stored |= describe(model=model, guide=guide, geometry=geometry)

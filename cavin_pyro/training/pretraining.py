@@ -71,7 +71,8 @@ def pretrain(
                 raise ValueError("its counters contradict one another")
     with progress_bar("pretraining", total=steps, initial=begun) as bar:
         for step in range(begun + 1, steps + 1):
-            batch = send(_augment(training[generator.integers(len(training), size=batch_size)], generator), device)
+            chosen = generator.integers(len(training), size=min(batch_size, len(training)))
+            batch = send(_augment(training[chosen], generator), device)
             optimizer.param_groups[0]["lr"] = rate
             optimizer.zero_grad(set_to_none=True)
             loss = autoencoder.loss(batch)

@@ -29,7 +29,7 @@ from cavin_pyro.envs.pusht.policy import (
     rotation,
 )
 from cavin_pyro.envs.randomness import named_stream
-from cavin_pyro.envs.world import Goal, NoRoomError, World, finite_numbers
+from cavin_pyro.envs.world import Goal, NoRoomError, World, finite_numbers, known_options
 from cavin_pyro.models.checks import check_choice, check_number
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -172,7 +172,7 @@ class PushT(World):
         """
         super().reset(seed=seed)
         (generator,) = self.np_random.spawn(1)
-        given, excluded = options or {}, 0
+        given, excluded = known_options(options, "state", "goal"), 0
         if self.criterion == "pose" and self.ahead and not {"state", "goal"} & set(given):
             state, self.pose, excluded = self._pair(generator)
         else:

@@ -35,7 +35,7 @@ from cavin_pyro.envs.tabletop.workspace import (
     push_endpoints,
     tile_center,
 )
-from cavin_pyro.envs.world import Geometry, World
+from cavin_pyro.envs.world import Geometry, World, known_options
 from cavin_pyro.models.checks import check_choice, check_number, typed
 from cavin_pyro.models.state import State
 
@@ -166,7 +166,7 @@ class PushingEnv(Uncopied, World):
         super().reset(seed=seed)
         (scene_generator,) = self.np_random.spawn(1)
         sampled = int(named_stream(scene_generator, LAYOUT).integers(len(self.tasks)))
-        number = (options or {}).get("layout", sampled)
+        number = known_options(options, "layout").get("layout", sampled)
         if number not in range(len(self.tasks)):
             raise ValueError(f"no layout {number} to reset to: choose from 0 to {len(self.tasks) - 1}")
         if self._generate is not None:
@@ -277,6 +277,7 @@ class PushingEnv(Uncopied, World):
         self.scene.markings, self.scene.places = self.task.tile_groups(), self.task.object_places()
 
     def close(self) -> None:
+        self._observation = None
         self.scene.close()
 
     def _begin(self, task: Task) -> None:

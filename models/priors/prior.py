@@ -28,7 +28,7 @@ class Prior(Protocol):
     def __call__(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
         """`state: [...]`, `effect_code: [..., C]` for p(z | s, c) -> batch `[...]`, event `[dimension]`.
 
-        Leading dimensions broadcast. A planner's warm start and its optimizers other than `shooting` need a Gaussian,
+        Leading dimensions broadcast. A planner's optimizers other than `shooting` need a Gaussian,
         or a distribution with a method `reparameterize(noise)`.
         """
 

@@ -17,6 +17,12 @@ from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
 from cavin_pyro.envs.world import NoRoomError
 
+LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
+    "scale": (0.1, 10.0),
+    "mass": (0.001, 1000.0),
+    "friction": (0.001, 10.0),
+    "kilograms": (0.001, 1000.0),
+}
 ATTEMPTS = 400  # arrangements sampled before an area counts as too small
 
 
@@ -31,6 +37,8 @@ class ObjectRanges:
         kilograms: mass of every object, instead of the factor.
         target: names for the first object, the target, instead of `names`.
         drop_height: metres above the table from which centres fall, at least; 0 means just above the table.
+
+    Raises ValueError: a range beyond `LIMITS`.
     """
 
     names: tuple[str, ...] = BUILTIN_NAMES
@@ -41,6 +49,14 @@ class ObjectRanges:
     kilograms: tuple[float, float] | None = None
     target: tuple[str, ...] = ()
     drop_height: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, (least, most) in LIMITS.items():
+            if (given := getattr(self, name)) is not None:
+                if len(given) != 2 or not least <= given[0] <= given[1] <= most:
+                    said = f"ranges.{name} must be low and high, from {least:g} to {most:g}"
+                    raise ValueError(f"{said}, not {list(given)}")
+                object.__setattr__(self, name, tuple(given))
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,8 @@ class PhysicsWorld(Uncopied):
     def reset(self) -> None:
         """Empty the world and put the table into it."""
         bullet = self.client
+        if not bullet.isConnected():
+            raise RuntimeError("this environment is closed: make another")
         bullet.resetSimulation()
         self.objects: list[int] = []  # bodies that `add_object` made
         self._cylinders: dict[tuple[float, float], int] = {}  # shapes for the test in `occupied`
