@@ -11,7 +11,6 @@ def main(config: DictConfig) -> None:
 
     It says each command that it runs, so that parts can be changed and run again. Resumes an interrupted run.
     """
-    import math
     import shlex
     import sys
     import time
@@ -24,17 +23,20 @@ def main(config: DictConfig) -> None:
     from cavin_pyro.storage.files import output_folder
     from cavin_pyro.storage.run_directory import check_same_run, write_config
 
-    world_of(config)  # refuses what is no world before anything is written
+    if (world := world_of(config)) is not None:  # what is none is refused before anything is written
+        world.close()
+    flags = [word for word in sys.argv if word == "--traceback"]
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=("output", "workers", "episodes"))
         write_config(home, config)
         steps, begun = list(steps_of(config, home)), time.monotonic()
-        torch.set_num_threads(min(2, config.workers))  # of training; its steps are too small for more
         for number, step in enumerate(steps):
-            left = math.ceil(sum(one.minutes for one in steps[number:]))
-            line = f"python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
+            left = max(1, round(sum(one.minutes for one in steps[number:])))
+            threads = 2 if step.command == "train" else 1  # its steps are too small for more
+            torch.set_num_threads(threads)
+            line = f"OMP_NUM_THREADS={threads} python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
             print(f"\n{number + 1} of {len(steps)}, about {left} min to go: {line}", flush=True)
-            sys.argv = [f"{step.command}.py", *step.options]
+            sys.argv = [f"{step.command}.py", *step.options, *flags]
             import_module(f"cavin_pyro.{step.command}").main()
         print(f"\n{(time.monotonic() - begun) / 60:.1f} min in all, in {home}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import gymnasium
@@ -27,13 +28,11 @@ Geometry = Callable[[Tensor], Tensor]
 
 def finite_numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]:
     """Values of one of these lengths, such as an action; a ValueError if they are others, or one is not finite."""
-    try:
+    with suppress(TypeError, ValueError):
         array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
-    if array.ndim != 1 or len(array) not in lengths or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
-    return array
+        if array.ndim == 1 and len(array) in lengths and np.isfinite(array).all():
+            return array
+    raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
 
 
 def known_options(options: Mapping[str, Any] | None, *names: str) -> Mapping[str, Any]:

@@ -39,8 +39,8 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
 
 def check_kinds(given: Mapping[str, Any], hints: Mapping[str, Any], error: type[Exception] = ValueError) -> None:
     """Raise an `error` unless each value is of the type, `Sequence[int] | None` or the like, of `hints`."""
-    for name in given.keys() & hints.keys():
-        if not _fits(given[name], hints[name]):
+    for name in hints:
+        if name in given and not _fits(given[name], hints[name]):
             wanted = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name])
             wanted = re.sub(r"\b(\w+\.)+", "", wanted)
             raise error(f"{name} must be of type {wanted}, not {reprlib.repr(given[name])}")
@@ -70,6 +70,7 @@ def _fits(value: Any, hint: Any) -> bool:
     if kind in (Union, UnionType):
         return any(_fits(value, one) for one in inner)
     if kind in (list, tuple, Sequence) and inner:
+        value = value.tolist() if hasattr(value, "tolist") else value  # an array or a tensor
         listed = isinstance(value, Sequence) and not isinstance(value, str | bytes)
         return listed and all(_fits(one, inner[0]) for one in value)
     if kind in (int, float):

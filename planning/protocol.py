@@ -338,7 +338,6 @@ class Plan(NamedTuple):
     share_reaching_goal: Tensor | None = None
 
 
-@runtime_checkable
 class Planner(Protocol):
     """Turns observed states into actions."""
 

@@ -145,15 +145,15 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
         return _refusal(error)
     if lacks_memory(error):
         return one_line(error)
-    variable = _of_environment(error)
+    variable = _of_environment(error) if isinstance(error, ValueError) else None
     return f"{variable} in the environment: {one_line(error)[:200]}: unset it" if variable else None
 
 
 def _of_environment(error: Exception) -> str | None:
     """The variable of a library, TQDM_NCOLS=x or the like, of whose value an error in that library complains."""
     frames = traceback.walk_tb(error.__traceback__)
-    begins = tuple(f"{frame.f_globals.get('__name__', '').partition('.')[0]}_".upper() for frame, _ in frames)
-    named = (one for one in os.environ.items() if one[0].startswith(begins) and one[1] and one[1] in str(error))
+    begins = tuple(f"{frame.f_globals.get('__name__', '-').partition('.')[0]}_".upper() for frame, _ in frames)
+    named = (one for one in os.environ.items() if one[0].startswith(begins) and repr(one[1]) in str(error))
     return next((f"{name}={value[:80]}" for name, value in named), None)
 
 

@@ -47,13 +47,14 @@ def compose(name: str, *overrides: str, **options: Any) -> DictConfig:
 
     The same by keyword: compose("plan", task="crossing", env={"camera": "kinect2"}).
     """
-    return composed(name, [*overrides, *(f"{one}={_word(value)}" for one, value in flat_options(options).items())])[0]
+    words = [f"{one}={as_typed(value)}" for one, value in flat_options(options).items()]
+    return composed(name, [*overrides, *words])[0]
 
 
-def _word(value: Any) -> str:
+def as_typed(value: Any) -> str:
     """A value as a user types it."""
     if isinstance(value, list | tuple):
-        return f"[{','.join(map(_word, value))}]"
+        return f"[{','.join(map(as_typed, value))}]"
     if value is None or isinstance(value, bool | int | float):
         return shown(value) if value is None or isinstance(value, bool) else str(value)
     if not isinstance(value, str | os.PathLike | Number):
@@ -150,7 +151,7 @@ def sweeps(overrides: Sequence[str]) -> Iterator[list[str]]:
 def of_sweep(overrides: Sequence[str]) -> tuple[set[str], list[str]]:
     """The options that vary in a sweep, and what Hydra is told about the folder of its runs."""
     parsed = [_parsed(word) for word in overrides]
-    folder = [f"hydra.sweep.dir={_word(str(one.value()))}" for one in parsed if one.key_or_group == "output"]
+    folder = [f"hydra.sweep.dir={as_typed(str(one.value()))}" for one in parsed if one.key_or_group == "output"]
     return {one.get_key_element() for one in parsed if one.is_sweep_override()}, folder
 
 

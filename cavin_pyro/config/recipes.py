@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from cavin_pyro.config.options import constructor_options, flat_options, shown
+from cavin_pyro.config.composition import as_typed
+from cavin_pyro.config.options import constructor_options, flat_options
 
 
 class Recipe(NamedTuple):
@@ -64,29 +65,32 @@ OWN = Recipe("", FLOW, "", {10: (20_000, 3_000), 20: (100_000, 8_000)})
 
 def steps_of(config: DictConfig, home: Path) -> Iterator[Step]:
     """The commands of `quickstart` in their order; each writes into a folder of `home`."""
-    world: dict[str, Any] = dict(config.world)
-    target = world.pop("_target_") or ""
-    name = target.split(".")[2] if target.startswith("cavin_pyro.envs.") else ""
-    recipe, env = WORLDS.get(name, OWN) if target else TABLETOP, [f"env={name}" if name else f"env._target_={target}"]
-    usual = constructor_options(target)
-    env += [
-        f"env.{option}={shown(value)}"
-        for option, value in flat_options(world).items()
-        if option not in usual or usual[option].default != value
-    ]
-    env = env if target else []
+    recipe, env = _of_world(config)
     minutes, seed, workers = int(config.minutes), f"seed={config.seed}", f"workers={config.workers}"
     transitions, steps = recipe.sizes[minutes]
     checkpoint = f"checkpoint={home / 'train' / 'checkpoint.safetensors'}"
 
-    def step(command: str, place: str, share: float, given: str, *more: str) -> Step:
-        return Step(command, [*given.split(), *more, f"output={home / place}"], share * minutes)
+    def step(command: str, place: str, share: float, *options: str) -> Step:
+        return Step(command, [*options, f"output={home / place}"], share * minutes)
 
-    collect = " ".join([*env, recipe.collect])
-    yield step("collect", "data", 0.2, collect, f"transitions={transitions}", seed, workers)
-    yield step("train", "train", 0.7, recipe.train, f"trainer.steps={steps}", f"data={home / 'data'}", seed)
+    collect, train, plan = recipe.collect.split(), recipe.train.split(), recipe.plan.split()
+    yield step("collect", "data", 0.2, *env, *collect, f"transitions={transitions}", seed, workers)
+    yield step("train", "train", 0.7, *train, f"trainer.steps={steps}", f"data={home / 'data'}", seed)
     for task in recipe.tasks:
-        planning, name = " ".join([*env, task, recipe.plan]), task.partition("=")[2]
-        more = (checkpoint, f"episodes={config.episodes}", "seed=20000", workers)
-        yield step("evaluate", f"evaluate{name and '-'}{name}", 0.08 / len(recipe.tasks), planning, *more)
-    yield step("plan", "episode", 0.02, planning, checkpoint, "seed=20000")
+        planned, name = [*env, *plan, *task.split(), checkpoint, "seed=20000"], task.partition("=")[2]
+        share = 0.08 / len(recipe.tasks)
+        yield step("evaluate", f"evaluate{name and '-'}{name}", share, *planned, f"episodes={config.episodes}", workers)
+    yield step("plan", "episode", 0.02, *planned)
+
+
+def _of_world(config: DictConfig) -> tuple[Recipe, list[str]]:
+    """The recipe of the chosen world, and the options that choose it, where they differ from its usual ones."""
+    world: Any = OmegaConf.to_container(config.world)
+    if not (target := world.pop("_target_")):
+        return TABLETOP, []
+    name, usual = target.split(".")[2] if target.startswith("cavin_pyro.envs.") else "", constructor_options(target)
+    options = [f"env={name}" if name else f"env._target_={target}"]
+    for option, value in world.items():
+        if option not in usual or usual[option].default != value:
+            options += [f"env.{key}={as_typed(one)}" for key, one in flat_options({option: value}).items()]
+    return WORLDS.get(name, OWN), options

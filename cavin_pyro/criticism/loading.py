@@ -193,7 +193,7 @@ def trained_windows(checkpoint: Checkpoint) -> tuple[WindowConfig, int, int]:
         stored = checkpoint.config["windows"]
         # A default in place of a value that lacks would hold out other windows.
         windows = configured(WindowConfig, {**stored, **{name: stored[name] for name in ALWAYS_STORED}}, "windows")
-        seed = int(checkpoint.config.get("split", checkpoint.config["seed"]))
+        seed = int(checkpoint.config["split" if "split" in checkpoint.config else "seed"])
         np.random.SeedSequence(seed)  # which takes no negative one
         return windows, int(checkpoint.config["model"]["segment_length"]), seed
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError, UserError) as error:

@@ -38,9 +38,9 @@ class WorldCollection:
         numbers = range(number * self.episodes_per_shard, (number + 1) * self.episodes_per_shard)
         world = _opened(json.dumps(self.world))
         episodes = []
-        for number in numbers:
-            with user_input("env", where=f"episode {number} of seed={self.seed}"):
-                episodes.append(collected(world, self.seed, number, self.steps))
+        for one in numbers:
+            with user_input("env", where=f"episode {one} of seed={self.seed}"):
+                episodes.append(collected(world, self.seed, one, self.steps))
         return packed(episodes, numbers, self.steps)
 
 
@@ -100,16 +100,16 @@ def checked_episode(
 ) -> Arrays:
     """An episode `[S + 1, M, P]`, `[S + 1, M, F]`, `[S, A]` and `[M]`, whose shapes and numbers are a space's.
 
-    A `UserError` says what is not.
+    A `UserError` says what is not, or that most steps are longer than the space's `step_range`.
     """
     motions = checked("actions", actions, torch.float32, (None, space.actions))
     if (largest := float(motions.abs().max())) > 1:
         raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
-    steps = float(places.diff(dim=0).abs().amax((1, 2)).median())
-    if steps > space.step_range:
+    typical = float(places.diff(dim=0).abs().amax((1, 2)).median())
+    if typical > space.step_range:
         raise UserError(
-            f"most steps move something by {steps:g} or more, beyond step_range={space.step_range:g}: same unit?"
+            f"most steps move something by {typical:g} or more, beyond step_range={space.step_range:g}: same unit?"
         )
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
     real = checked("mask", mask, torch.bool, places.shape[1:2])

@@ -109,7 +109,7 @@ def make_env(
 
 @typed(UserError)
 def make_planner(
-    model: Model | None,
+    model: Any,
     planner: str | Mapping[str, Any] = "cavin",
     *,
     pushes_per_plan: int | None = 1,

@@ -137,7 +137,7 @@ class EpisodeCallback:
 @typed(UserError)
 def rollout(
     env: World,
-    planner: Planner,
+    planner: Any,
     *,
     seed: int,
     pushes_per_plan: int | None = 1,
@@ -171,6 +171,8 @@ def rollout(
             optimizer, a world or a planner of the user's own raises an error.
         RuntimeError: the robot stands in the camera's view.
     """
+    if not hasattr(planner, "plan"):
+        raise UserError(f"planner must have a method plan, as of make_planner, and {type(planner).__name__} has none")
     device = choose_device(device) if isinstance(device, str) else device
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
@@ -179,8 +181,9 @@ def rollout(
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
     if photograph and env.render_mode is None:
         raise UserError(f"photograph=True needs a {type(env).__name__} with pictures: build it with render=True")
-    if start is not None and not env.observation_space.contains(start):
-        raise UserError("start must be an observation as of env.reset, or of env.step")
+    if start is not None:
+        with user_input(where="start is no observation as of env.reset or env.step"):
+            env.state(start)
     episode = Episode(seed)
     generator = torch.Generator().manual_seed(planner_seed(seed))
 

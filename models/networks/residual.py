@@ -22,7 +22,7 @@ class ResidualDynamics(Outcome):
     """f: the mean of the state after one action, by residual layers for each object.
 
     own_i      = what networks read of position i, its waves from the space's origin, and its feature
-    relation_i = sum over other real objects j of FC(linear of own_i + linear of own_j)
+    relation_i = sum over other real objects j of ReLU(linear of own_i + linear of own_j)
     x_i        = linear of own_i + linear of relation_i + linear of the action
     x_i        = x_i + linear of SiLU(linear of LayerNorm(x_i)), `depth` times
     change of position and feature i = linear of x_i, in units of `length` and of 1
@@ -35,7 +35,12 @@ class ResidualDynamics(Outcome):
     def __init__(
         self, space: Space, *, feature_dimension: int = 64, width: int = 64, hidden: int = 256, depth: int = 3
     ) -> None:
-        """`hidden`: width of the layers. `depth`: number of residual layers. `width`: of the encoder, which f omits."""
+        """The layers.
+
+        Args:
+            hidden: width of the layers. depth: number of residual layers.
+            width: of the state encoder, which it does not read.
+        """
         check_number("hidden", hidden, 1, whole=True)
         check_number("depth", depth, whole=True)
         super().__init__()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectSet, cho
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
 from cavin_pyro.envs.world import NoRoomError
+from cavin_pyro.models.checks import check_kinds
 
 LIMITS = {  # of ranges; what lies beyond is a slip, with which no scene comes to rest
     "scale": (0.1, 10.0),
@@ -51,6 +53,7 @@ class ObjectRanges:
     drop_height: float = 0.0
 
     def __post_init__(self) -> None:
+        check_kinds(vars(self), get_type_hints(type(self)))
         for name, (least, most) in LIMITS.items():
             if (given := getattr(self, name)) is not None:
                 if len(given) != 2 or not least <= given[0] <= given[1] <= most:

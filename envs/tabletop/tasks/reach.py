@@ -24,8 +24,8 @@ Moves = Sequence[tuple[int, int, Mask]]
 def check_reach(task: Task) -> None:
     """Check that pushes along x and y can bring an object, alone on the table, from every start tile to the goal.
 
-    A task with a goal for each object passes. Raises ValueError: from a start tile they cannot; it is named, and so is
-    the tile where pushes end.
+    A task passes that has a goal for each object, or one that no object reaches alone. Raises ValueError: from a start
+    tile they cannot; it is named, and so is the tile where pushes end.
     """
     if not task.goal_is_shared:
         return
@@ -33,6 +33,8 @@ def check_reach(task: Task) -> None:
     outcome, places = outcome_alone(TaskReward(task), points), points.numpy()
     inner = table_distance(points) > 0.03  # every point has four neighbours
     free, goal = (~outcome.failure & inner).numpy(), (outcome.success & inner).numpy()
+    if not goal.any():
+        return
     pushes = [(axis, sign, _can_push(places, axis, sign)) for axis, sign in product((0, 1), (1, -1))]
     solved = _steps(goal, free, [(axis, -sign, np.roll(possible, sign, axis)) for axis, sign, possible in pushes])
     away = _steps(goal, free, [(axis, sign, np.ones_like(free)) for axis, sign, _ in pushes])
