@@ -32,9 +32,10 @@ def main(config: DictConfig) -> None:
         steps, begun = list(steps_of(config, home)), time.monotonic()
         for number, step in enumerate(steps):
             left = max(1, round(sum(one.minutes for one in steps[number:])))
-            threads = 2 if step.command == "train" else 1  # its steps are too small for more
+            # Steps of training are too small for more threads.
+            threads, variable = (2, "OMP_NUM_THREADS=2 ") if step.command == "train" else (1, "")
             torch.set_num_threads(threads)
-            line = f"OMP_NUM_THREADS={threads} python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
+            line = f"{variable}python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
             print(f"\n{number + 1} of {len(steps)}, about {left} min to go: {line}", flush=True)
             sys.argv = [f"{step.command}.py", *step.options, *flags]
             import_module(f"cavin_pyro.{step.command}").main()

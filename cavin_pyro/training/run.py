@@ -188,12 +188,9 @@ def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geo
     given = [one.states.centers.shape[-1], one.states.features.shape[-1], one.actions.shape[-1]]
     wanted = [model.space.positions, model.feature_dimension, model.space.actions]
     if given != wanted or windows.objects > model.maximum_objects:
-        if given == wanted:
-            raise ValueError(
-                f"the windows have {windows.objects} objects: build the model with maximum_objects={windows.objects}"
-            )
-        sizes = "positions, features and actions of {}, {} and {} numbers"
-        raise ValueError(f"the windows have {sizes.format(*given)}, not {wanted}: build the model for them")
+        sizes = "positions, features and actions of {}, {} and {} numbers and {} objects"
+        have, take = sizes.format(*given, windows.objects), sizes.format(*wanted, f"up to {model.maximum_objects}")
+        raise ValueError(f"the windows have {have}, and the model takes {take}: build it for them")
 
 
 def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int, seed: int, where: str) -> None:

@@ -35,12 +35,7 @@ class ResidualDynamics(Outcome):
     def __init__(
         self, space: Space, *, feature_dimension: int = 64, width: int = 64, hidden: int = 256, depth: int = 3
     ) -> None:
-        """The layers.
-
-        Args:
-            hidden: width of the layers. depth: number of residual layers.
-            width: of the state encoder, which it does not read.
-        """
+        """`hidden`: width of the layers. `depth`: number of residual layers. `width`: of the encoder, not read."""
         check_number("hidden", hidden, 1, whole=True)
         check_number("depth", depth, whole=True)
         super().__init__()

@@ -44,6 +44,6 @@ def test_one_command_makes_a_planner_and_goes_on_where_it_stopped(
         monkeypatch.setattr(sys, "argv", ["quickstart.py", *words, "workers=1"])
         quickstart.main()
     said = capsys.readouterr()
-    assert [line.split()[0] for line in said.out.splitlines() if " min to go: python -m " in line] == [*"1234"] * 2
+    assert [line.split()[0] for line in said.out.splitlines() if " min to go: " in line] == [*"1234"] * 2
     assert (tmp_path / "episode" / "episode.mp4").exists() and (tmp_path / "evaluate" / "results.json").exists()
     assert "training: finished at step 2" in said.err  # the second time
