@@ -100,16 +100,16 @@ def checked_episode(
 ) -> Arrays:
     """An episode `[S + 1, M, P]`, `[S + 1, M, F]`, `[S, A]` and `[M]`, whose shapes and numbers are a space's.
 
-    A `UserError` says what is not, or that most steps are longer than the space's `step_range`.
+    A `UserError` says what is not, or that most steps are more than ten times the space's `step_range`.
     """
     motions = checked("actions", actions, torch.float32, (None, space.actions))
     if (largest := float(motions.abs().max())) > 1:
         raise UserError(f"actions has numbers as large as {largest:g}, out of the box from -1 to 1")
     places = checked("centers", centers, torch.float32, (len(motions) + 1, objects, space.positions))
     typical = float(places.diff(dim=0).abs().amax((1, 2)).median())
-    if typical > space.step_range:
+    if typical > 10 * space.step_range:
         raise UserError(
-            f"most steps move something by {typical:g} or more, beyond step_range={space.step_range:g}: same unit?"
+            f"most steps are {typical:g} long, and step_range of the space {space.step_range:g}: same unit?"
         )
     others = checked("features", features, torch.float32, (*places.shape[:2], feature_dimension))
     real = checked("mask", mask, torch.bool, places.shape[1:2])

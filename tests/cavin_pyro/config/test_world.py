@@ -46,7 +46,7 @@ def test_a_preset_sets_the_ranges_and_options_change_them(overrides: list[str], 
     "override", ["names=[fork]", "names=[]", "target=[fork]", "mass=[2,1]", "scale=[0.01,1]", "friction=[0.5]"]
 )
 def test_ranges_that_make_no_sense_are_named(override: str) -> None:
-    with pytest.raises(UserError, match=rf"env\.ranges\.{override.partition('=')[0]}\b"):
+    with pytest.raises(UserError, match=rf"ranges\.{override.partition('=')[0]}\b"):
         object_ranges(compose("plan", f"env.ranges.{override}").env)
 
 
