@@ -32,7 +32,6 @@ def main(config: DictConfig) -> None:
         steps, begun = list(steps_of(config, home)), time.monotonic()
         for number, step in enumerate(steps):
             left = max(1, round(sum(one.minutes for one in steps[number:])))
-            # Steps of training are too small for more threads.
             threads, variable = (2, "OMP_NUM_THREADS=2 ") if step.command == "train" else (1, "")
             torch.set_num_threads(threads)
             line = f"{variable}python -m cavin_pyro.{step.command} {shlex.join(step.options)}"

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from cavin_pyro.planning import records
+from cavin_pyro.planning.checks import UnsuitedError
 
 GRAPHS = "cuda_graphs"  # value of `compile`
 MOST_GRAPHS = 64  # each keeps its results in the GPU's memory
@@ -104,7 +105,7 @@ class CudaGraphs:
     def _captured(self, function: Callable[..., Any], arguments: Any, tensors: list[Tensor]) -> Graph | None:
         device = next((tensor.device for tensor in tensors if tensor.device.type == "cuda"), None)
         if device is None:
-            raise ValueError(
+            raise UnsuitedError(
                 f"compile={GRAPHS} needs a model and a state on a GPU, and {function.__name__} got tensors on the CPU: "
                 "choose compile=true, or plan on a GPU"
             )

@@ -27,7 +27,7 @@ class OptimizerError(ValueError):
 
 
 class UnsuitedError(ValueError):
-    """A planner or an addition asks for what this world does not have."""
+    """A planner or an addition asks for what this world or this machine does not have."""
 
 
 def check_horizon(horizon: int, segment_length: int) -> None:

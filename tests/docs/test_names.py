@@ -15,7 +15,7 @@ from tests.docs.pages import PAGES, ROOT, code_in_prose, links, name
 from tests.test_repository import PACKAGES
 
 FOLDERS = (*PACKAGES, "tests", "benchmarks", "checkpoints", "docs", "notebooks")
-COMMANDS = ("check", "collect", "evaluate", "imagine", "plan", "pretrain", "reproduce", "train")
+COMMANDS = ("check", "collect", "evaluate", "imagine", "plan", "pretrain", "quickstart", "reproduce", "train")
 PLANNERS = ("cavin", "cavin_without_effects", "sectar", "cvae_mpc", "mpc", "random")
 GROUPS = {"env/ranges", "model", "guide", "prior", "objective", "scales", "planner"}
 TOO_GENERAL = re.compile(r"NAME|TASK_N|\*")
