@@ -25,7 +25,6 @@ def main(config: DictConfig) -> None:
 
     if (world := world_of(config)) is not None:  # what is none is refused before anything is written
         world.close()
-    flags = [word for word in sys.argv if word == "--traceback"]
     with output_folder(config.output) as home:
         check_same_run(home, config, ignore=("output", "workers", "episodes"))
         write_config(home, config)
@@ -36,7 +35,7 @@ def main(config: DictConfig) -> None:
             torch.set_num_threads(threads)
             line = f"{variable}python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
             print(f"\n{number + 1} of {len(steps)}, about {left} min to go: {line}", flush=True)
-            sys.argv = [f"{step.command}.py", *step.options, *flags]
+            sys.argv = [f"{step.command}.py", *step.options, *({"--traceback"} & {*sys.argv})]
             import_module(f"cavin_pyro.{step.command}").main()
         print(f"\n{(time.monotonic() - begun) / 60:.1f} min in all, in {home}")
 

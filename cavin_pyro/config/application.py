@@ -153,10 +153,9 @@ def _of_environment(error: Exception) -> str | None:
     """The variable of a library, TQDM_NCOLS=x or the like, of whose value an error in that library complains."""
     frames = traceback.walk_tb(error.__traceback__)
     begins = tuple(f"{frame.f_globals.get('__name__', '-').partition('.')[0]}_".upper() for frame, _ in frames)
-    named = (one for one in os.environ.items() if one[0].startswith(begins) and one[1] not in ("", "1"))
-    return next(
-        (f"{name}={value[:80]}" for name, value in named if value in re.findall(r"[\w.+/-]+", f"{error}")), None
-    )
+    said = {*re.findall(r"[\w.+/-]+", str(error))} - {"1"}
+    named = (f"{name}={value[:80]}" for name, value in os.environ.items() if name.startswith(begins) and value in said)
+    return next(named, None)
 
 
 def _refusal(error: OSError) -> str:
