@@ -237,6 +237,6 @@ def test_neither_an_interrupted_import_nor_a_wrong_environment_ends_in_a_traceba
     (tmp_path / "slow.py").write_text(
         "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nfinally:\n    raise ImportError"
     )
-    command = [sys.executable, *flags.split(), "-c", program]
-    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+    line = ["env", "--default-signal=INT", sys.executable, *flags.split(), "-c", program]
+    done = subprocess.run(line, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == status and done.stderr.startswith(f"error: {said}") and done.stderr.count("\n") == 1
