@@ -1,6 +1,6 @@
 """What `quickstart` runs: the commands from an empty folder to a planner, by world and number of minutes.
 
-Minutes are those of two idle cores. docs/results.md has what comes out.
+Minutes are those of the tabletop on two idle cores. docs/results.md has what comes out.
 """
 
 from __future__ import annotations
