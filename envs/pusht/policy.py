@@ -16,10 +16,9 @@ SPACING = 5.0  # pixels between the points of the outline that the policy knows
 ARRIVED = 6.0  # pixels from where a push begins
 APPROACHES = 6  # steps on the way to a push, at most
 ASTRAY = 0.1  # of the intents are random moves
-STRAIGHT = 0.15  # of the approaches go straight, through the block if it is in the way
-CARELESS = 0.05  # of the pushes may press the block into a wall
+MARGIN = 35.0  # pixels that pushes leave between block and wall, in which the disc can pass
 CANDIDATES = 12  # pushes to choose one from
-ROUND = 110.0  # pixels from the block's centre of mass, on the way round it
+ROUND = 115.0  # pixels from the block's centre of mass, on the way round it
 NOISE = 3.0  # pixels; standard deviation of a push's displacement, on each axis
 
 ObservationDict = dict[str, NDArray[np.float64]]
@@ -34,7 +33,6 @@ class PushTPolicy:
     def __init__(self, generator: np.random.Generator) -> None:
         self._generator = generator
         self._approaches = self._pushes = self._moves = 0  # steps left of each kind
-        self._straight = False
         self._contact, self._displacement = np.zeros((2, 2))  # in the block's frame; of the next push, in the window's
         self._turn = 0.0  # radians from one push to the next
 
@@ -49,7 +47,7 @@ class PushTPolicy:
         start = in_window(block, self._contact)
         if self._approaches and np.linalg.norm(start - agent) > ARRIVED:
             self._approaches -= 1
-            way = (start if self._straight else _way(agent, start, block)) - agent
+            way = _way(agent, start, block) - agent
             return way / max(REACH, float(np.abs(way).max()))
         self._approaches = 0
         self._pushes -= 1
@@ -72,19 +70,17 @@ class PushTPolicy:
         inward = -normals[chosen] @ rotation(float(block[2])).T
         angles = np.arctan2(inward[:, 1], inward[:, 0]) + generator.normal(scale=0.5, size=CANDIDATES)
         headings = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-        room = np.where(headings > 0, WALLS[1] - outline.max(axis=0), outline.min(axis=0) - WALLS[0])
+        room = np.where(headings > 0, WALLS[1] - outline.max(axis=0), outline.min(axis=0) - WALLS[0]) - MARGIN
         room = (np.maximum(room, 0.0) / np.maximum(np.abs(headings), 1e-6)).min(axis=-1) + gaps[:, 0] - RADIUS
         reachable = ((starts > WALLS[0] + RADIUS) & (starts < WALLS[1] - RADIUS)).all(axis=-1)
         cost = np.linalg.norm(starts - agent, axis=-1) * generator.integers(2)
         cost += generator.uniform(0.0, 100.0, CANDIDATES) + 4 * SIZE * ~reachable
-        if generator.random() > CARELESS:
-            cost += SIZE * (room < 40.0)
-            length = np.minimum(length, room / steps)
+        cost += SIZE * (room < 100.0)
+        length = np.minimum(length, room / steps)
         best = int(cost.argmin())
         self._contact = contacts[best]
-        self._displacement = np.broadcast_to(length, CANDIDATES)[best] * headings[best]
+        self._displacement = length[best] * headings[best]
         self._approaches, self._pushes, self._turn = APPROACHES, steps, float(generator.normal(scale=0.25))
-        self._straight = bool(generator.random() < STRAIGHT)
 
 
 def outline_of(state: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -322,10 +322,10 @@ class PushT(World):
         raise NoRoomError("no start apart from its goal in 100 episodes: choose a larger ahead")
 
     def _sample(self, generator: np.random.Generator) -> NDArray[np.float64]:
-        """A random state [5] in which nothing touches anything."""
+        """A random state [5] of gym-pusht's ranges, in which nothing touches anything."""
         while True:
-            pose = np.array([*generator.uniform(*WALLS, size=2), generator.uniform(-np.pi, np.pi)])
-            agent = generator.uniform(WALLS[0] + RADIUS, WALLS[1] - RADIUS, size=2)
+            pose = np.array([*generator.uniform(100.0, 400.0, size=2), generator.uniform(-np.pi, np.pi)])
+            agent = generator.uniform(50.0, 450.0, size=2)
             outline = in_window(pose, SKIN[0])
             # The disc's centre is outside if the nearest point of the outline shows it its outer side.
             nearest = int(np.linalg.norm(outline - agent, axis=-1).argmin())
