@@ -8,7 +8,6 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import EffectTrunk
 from cavin_pyro.models.networks.layers import (
@@ -30,7 +29,7 @@ class CascadedGuide(Guide):
 
     def __init__(
         self,
-        model: CascadedModel,
+        model: Model,
         *,
         width: int = 64,
         effect_reads_actions: bool = False,

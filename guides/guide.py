@@ -25,7 +25,7 @@ class Guide(Program):
     def __init__(self, model: Model) -> None:
         """Raises `ValueError` for an incompatible model."""
         super().__init__()
-        if not isinstance(model, Model) or model.name not in self.fits:
+        if model.name not in self.fits:
             raise ValueError(
                 f"guide {type(self).__name__} does not fit model {type(model).__name__}; it fits {', '.join(self.fits)}"
             )

@@ -12,7 +12,6 @@ from pyro import poutine
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
@@ -100,10 +99,7 @@ class Model(Program):
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
-        for name in ("segment_length", "feature_dimension", "width", "maximum_objects"):
-            check_number(name, getattr(self, name), 1, whole=True)
         self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
-        check_number("neighbours", self.neighbours, whole=True)
         self.scales = scales or LikelihoodScales(space)
         sizes = {"feature_dimension": feature_dimension, "width": width}
         self.encoder = StateEncoder(space, neighbours=self.neighbours, **sizes)

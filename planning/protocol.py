@@ -16,11 +16,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from cavin_pyro.models.checks import typed
 from cavin_pyro.models.state import State
 
 ScoreStateKind = TypeVar("ScoreStateKind")
 
 
+@runtime_checkable
 class TransitionModel(Protocol):
     """The dynamics f alone (paper, equation 1), of which planners take the mean.
 
@@ -160,6 +162,7 @@ class RemainingDistance(Protocol):
         """An upper bound on what is left with the objects in `mask: [..., M]`: `[...]`."""
 
 
+@runtime_checkable
 class RewardFunction(Protocol):
     """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
 
@@ -215,9 +218,10 @@ class FunctionReward(Reward):
         return self.function(previous, centers, mask)
 
 
-def as_reward(function: RewardFunction) -> Reward:
+@typed(ValueError)
+def as_reward(reward: RewardFunction) -> Reward:
     """A reward function itself, or with the defaults of `Reward` if it has no more than its call."""
-    return function if isinstance(function, Reward) else FunctionReward(function)
+    return reward if isinstance(reward, Reward) else FunctionReward(reward)
 
 
 class Query(NamedTuple):

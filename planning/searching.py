@@ -11,7 +11,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_choice, check_number
+from cavin_pyro.models.checks import check_choice, check_number, typed
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions import Addition, make_additions
@@ -70,6 +70,7 @@ class SearchingPlanner(ABC):
     requires: ClassVar[ModelRequirements]  # of the planner on its model
     hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank")  # of `Addition`, which the planner calls
 
+    @typed(ValueError)
     def __init__(
         self,
         model: TransitionModel,

@@ -22,7 +22,7 @@ from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, ListConfi
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, parameters_of
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
@@ -192,20 +192,7 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
         found = get_object(target)
     except (Exception, SystemExit):  # a user's module may raise anything; building the part says it in one line
         return {}
-    constructors = [found]
-    if inspect.isclass(found):
-        constructors = [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]
-    options: dict[str, inspect.Parameter] = {}
-    for constructor in constructors:
-        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] != "cavin_pyro":
-            break
-        hints, parameters = get_type_hints(constructor), inspect.signature(constructor).parameters.values()
-        for one in parameters:
-            if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY) and one.name != "self":
-                options.setdefault(one.name, one.replace(annotation=hints.get(one.name, Any)))
-        if not any(one.kind is one.VAR_KEYWORD for one in parameters):
-            break
-    return options
+    return parameters_of(found, "cavin_pyro.")
 
 
 def is_shown(one: inspect.Parameter) -> bool:
