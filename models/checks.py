@@ -54,9 +54,9 @@ def told(value: Any) -> str:
 
 
 def check_arguments(kind: type, by_position: Sequence[Any], by_keyword: Mapping[str, Any]) -> None:
-    """Raise ValueError unless arguments of a class are of their annotations' types; whole numbers are sizes, above 0."""
+    """Raise ValueError unless arguments of a class are of their annotations' types, and whole numbers are above 0."""
     taken = parameters_of(kind)
-    given = dict(zip(taken, by_position, strict=False)) | by_keyword
+    given = {**dict(zip(taken, by_position, strict=False)), **by_keyword}
     hints = {name: one.annotation for name, one in taken.items()}
     for name, value in given.items():
         if hints.get(name) in (int, int | None) and value is not None:

@@ -111,17 +111,20 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
         if isinstance(value, list) and one.kind is not Any and any(isinstance(entry, list | dict) for entry in value):
             raise UserError(f"{prefix}{one.name} must be a plain list such as [a,b], not {value}")
         if value is not None:
-            check_value(f"{prefix}{one.name}", value, one.about)
+            check_value(f"{prefix}{one.name}", value, one.about, listed=one.kind is not Any)
 
 
-def check_value(name: str, value: Any, about: About) -> None:
-    """Raise a `UserError` for a value that is out of its range, or none of the choices; the line states them."""
+def check_value(name: str, value: Any, about: About, *, listed: bool = True) -> None:
+    """Raise a `UserError` for a value that is out of its range, or none of the choices; the line states them.
+
+    `listed`: whether it may be a list of choices.
+    """
     if isinstance(value, Mapping) and value.get("_target_"):
         return  # a class of the user's, which says itself what is wrong with it
     if about.choices is not None:
         if value == []:
             raise UserError(f"{name} must name at least one: choose from {', '.join(about.names or ())}")
-        for entry in value if isinstance(value, list) else [value]:
+        for entry in value if isinstance(value, list) and listed else [value]:
             if str(entry) not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return

@@ -46,8 +46,8 @@ OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `plan
 def make_additions(additions: Sequence[str | Addition], hooks: Sequence[str]) -> tuple[Addition, ...]:
     """Additions by name, with their defaults, or given, in the order in which they act.
 
-    `hooks`: which the planner calls. Raises ValueError: an unknown name, an addition that is given twice, or one without
-    a hook that the planner calls.
+    `hooks`: which the planner calls. Raises ValueError: an unknown name, an addition that is given twice or lacks every
+    hook that the planner calls.
     """
     made = []
     for addition in additions:
