@@ -117,6 +117,7 @@ def build_model(config: Config) -> Model:
         parts["scales"] = build_part("scales", config.get("scales") or FIXED_SCALES, space=space)
         parts["space"] = space
     model: Model = build_part("model", sizes, **parts)
+    model.check_priors()
     if "prior" in config and not kinds and config["prior"].get("_target_") != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model

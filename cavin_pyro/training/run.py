@@ -184,6 +184,7 @@ def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geo
             raise ValueError(f"the windows' features are not of this {type(geometry).__name__}: give what made them")
     if guide.model is not model:
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
+    model.check_priors()
     one = windows.batch(windows.training[:1])
     given = [one.states.centers.shape[-1], one.states.features.shape[-1], one.actions.shape[-1]]
     wanted = [model.space.positions, model.feature_dimension, model.space.actions]
