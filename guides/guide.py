@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from cavin_pyro.models.checks import typed
 from cavin_pyro.models.model import Model, Program
 from cavin_pyro.models.state import Window
 
@@ -32,6 +33,7 @@ class Guide(Program):
         # In a tuple, so that the model's parameters are not registered (and saved) in the guide as well.
         self._model = (model,)
 
+    @typed(ValueError)
     def __call__(self, window: Window) -> Any:
         """Infer the codes of whole windows. Raises `ValueError` for initial ones."""
         if not window.whole:

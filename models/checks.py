@@ -49,8 +49,11 @@ def check_kinds(given: Mapping[str, Any], hints: Mapping[str, Any], error: type[
 
 
 def told(value: Any) -> str:
-    """A value in an error's line: what would take several lines is told by its class."""
-    return f"an object of {type(value).__name__}" if "\n" in repr(value) else reprlib.repr(value)
+    """A value in an error's line: what has no short text is told by its class."""
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    said = repr(value)
+    return f"an object of {type(value).__name__}" if "\n" in said or said[:1] == "<" else reprlib.repr(value)
 
 
 def check_arguments(kind: type, by_position: Sequence[Any], by_keyword: Mapping[str, Any]) -> None:

@@ -14,7 +14,7 @@ from pyro.distributions import TorchDistribution
 from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 
-from cavin_pyro.models.checks import told
+from cavin_pyro.models.checks import told, typed
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
@@ -147,6 +147,7 @@ class Model(Program):
         """Mean of f: `state: [...]`, `action: [..., A]` -> the state after one action."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
+    @typed(ValueError)
     def encode(self, window: Window) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 

@@ -86,6 +86,7 @@ class SearchingPlanner(ABC):
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names."""
         check_number("samples", samples, 1, whole=True)
+        check_number("decimals", 1 if decimals is None else decimals, 1)
         check_horizon(horizon, model.segment_length)
         check_choice("reward_at", reward_at, REWARD_AT)
         self.optimizer = make_optimizer(optimizer, samples=samples)

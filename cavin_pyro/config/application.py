@@ -35,6 +35,7 @@ else:
 
 # docs/reliability.md
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "quickstart", "assets")
+TO = ("assets", "data")  # take --to DIR instead of output=DIR
 _TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENODEV}  # the last: to map a folder
 _DENIED = {errno.EACCES, errno.EPERM}
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, *_DENIED, *_TAKEN}
@@ -123,7 +124,7 @@ def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[st
         line = _line(error, words)
         if line is None or "--traceback" in sys.argv:
             raise
-        _stop(line, getattr(error, "status", 2))
+        _stop(line.replace("output=DIR", "--to DIR") if name in TO else line, getattr(error, "status", 2))
 
 
 def _line(error: Exception, words: Sequence[str]) -> str | None:

@@ -110,7 +110,7 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
             value = value[part]
         if isinstance(value, list) and one.kind is not Any and any(isinstance(entry, list | dict) for entry in value):
             raise UserError(f"{prefix}{one.name} must be a plain list such as [a,b], not {value}")
-        if value is not None:
+        if value is not None or (one.kind is Any and one.about.choices):
             check_value(f"{prefix}{one.name}", value, one.about, listed=one.kind is not Any)
 
 

@@ -17,9 +17,10 @@ from torch import nn
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line, user_input
-from cavin_pyro.config.options import constructor_options
+from cavin_pyro.config.options import constructor_options, shown
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.checks import check_kinds
 from cavin_pyro.models.likelihoods import Scales
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.dynamics import Outcome
@@ -69,7 +70,9 @@ def _is_a(made: Any, kind: type) -> bool:
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
     """Raise a `UserError` for a number that is not finite, or a whole one out of range, but for those that may be 0."""
     if not isinstance(config, Mapping | DictConfig):
-        raise UserError(f"{section} is a section of options, {section}.NAME=VALUE, which {config} cannot replace")
+        raise UserError(
+            f"{section} is a section of options, {section}.NAME=VALUE, which {shown(config)} cannot replace"
+        )
     for name, value in config.items():
         option = f"{section}.{name!s}"
         if isinstance(value, Mapping | DictConfig):
@@ -98,6 +101,7 @@ def build_model(config: Config) -> Model:
     `model` itself has the parts, as `describe` writes it. A part that cannot be built is a `UserError`. The section
     `space` is the world's; without it, the tabletop's.
     """
+    check_kinds(config, dict.fromkeys(("space", *PARTS), Mapping | None))
     sizes, parts, kinds = dict(config["model"]), dict[str, Any](), list[str]()
     if "prior" in config:
         if missing := [name for name in ("_target_", "feature_dimension", "width") if name not in sizes]:

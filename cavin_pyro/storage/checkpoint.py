@@ -175,7 +175,7 @@ def save(
         for name, part in (("model", model), ("guide", inferring), ("geometry", geometry)):
             _ = part is None or getattr(made, name)
     about = {"config": stored, "provenance": of_this_process() if provenance is None else provenance}
-    with user_input():
+    with user_input(where="config and provenance must be plain data"):
         header = {name: json.dumps(part) for name, part in about.items()}
     header |= {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
     with atomic_write(Path(path)) as temporary:  # `save_file` would hide the error of a full disk

@@ -31,7 +31,9 @@ OPTIMIZERS: dict[str, type[Optimizer]] = {
 }
 
 
-def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
+def make_optimizer(
+    optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer", size: str = ""
+) -> Optimizer:
     """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
 
     Raises ValueError, naming the valid ones, for an unknown name or an object that is no optimizer, and for fewer
@@ -46,5 +48,5 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
             f"optimize(problem, samples), not {optimizer!r}"
         )
     if isinstance(optimizer, CEM | MPPI):
-        samples_of_iteration(samples, optimizer.iterations, 0)
+        samples_of_iteration(samples, optimizer.iterations, 0, size)
     return optimizer
