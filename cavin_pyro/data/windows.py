@@ -115,7 +115,7 @@ class WindowTable:
             counts = [str(len(part)) if isinstance(part, Sized) else type(part).__name__ for part in parts]
             if not isinstance(space, Space) or len({*counts}) > 1 or not counts[0].isdecimal():
                 given = f"{type(space).__name__} and {', '.join(counts)}"
-                raise UserError(f"give a Space, and lists of as many centers, features, actions and masks, not {given}")
+                raise UserError(f"give a Space, and as many centers, features, actions and masks in lists, not {given}")
             episodes: list[Arrays] = []
             sizes: dict[str, int] = {}  # of the first
             for number, one in enumerate(zip(*parts, strict=True)):
