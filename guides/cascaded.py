@@ -10,11 +10,7 @@ from torch import Tensor, nn
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import EffectTrunk
-from cavin_pyro.models.networks.layers import (
-    GaussianCode,
-    ObjectPool,
-    fully_connected,
-)
+from cavin_pyro.models.networks.layers import GaussianCode, ObjectPool, fully_connected
 from cavin_pyro.models.state import State, Window
 
 

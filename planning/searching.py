@@ -16,12 +16,7 @@ from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions import Addition, make_additions
 from cavin_pyro.planning.backends import make_backend
-from cavin_pyro.planning.checks import (
-    NoFiniteCandidateError,
-    OptimizerError,
-    check_horizon,
-    check_scenes,
-)
+from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, check_horizon, check_scenes
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import (
     FixedShapes,

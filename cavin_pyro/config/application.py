@@ -138,7 +138,7 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
             if key in said:
                 return said
             own = f"|{re.escape(value)}" if len(value) > 3 else ""
-            if found := re.search(rf"\b{re.split('[./]', key)[-1]}\b{own}", said):
+            if found := re.search(rf"\b{re.split('[./]', key.removesuffix('._target_'))[-1]}\b{own}", said):
                 places[found.start()] = f"{key}={value}"
         about = [places[min(places)]] if places else given if error.unclear else []  # first what is wrong, then others
         return f"{', '.join(about)}: {said}" if about else said

@@ -19,15 +19,7 @@ from cavin_pyro.config.commands import DEFAULT_CHECKPOINT, TrainerConfig, Window
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED, configured, constructor_options, shown
-from cavin_pyro.config.parts import (
-    PARTS,
-    Config,
-    amortized_guides,
-    build_guide,
-    build_model,
-    build_part,
-    describe,
-)
+from cavin_pyro.config.parts import PARTS, Config, amortized_guides, build_guide, build_model, build_part, describe
 from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space

@@ -11,24 +11,9 @@ from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.mppi import MPPI
 from cavin_pyro.planning.optimizers.smc import SMC
 
-__all__ = [
-    "CEM",
-    "ICEM",
-    "MPPI",
-    "OPTIMIZERS",
-    "SMC",
-    "Optimizer",
-    "Shooting",
-    "make_optimizer",
-]
+__all__ = ["CEM", "ICEM", "MPPI", "OPTIMIZERS", "SMC", "Optimizer", "Shooting", "make_optimizer"]
 
-OPTIMIZERS: dict[str, type[Optimizer]] = {
-    "shooting": Shooting,
-    "cem": CEM,
-    "icem": ICEM,
-    "mppi": MPPI,
-    "smc": SMC,
-}
+OPTIMIZERS: dict[str, type[Optimizer]] = {"shooting": Shooting, "cem": CEM, "icem": ICEM, "mppi": MPPI, "smc": SMC}
 
 
 def make_optimizer(
