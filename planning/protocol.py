@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from cavin_pyro.models.checks import typed
+from cavin_pyro.models.checks import check_kinds, typed
 from cavin_pyro.models.state import State
 
 ScoreStateKind = TypeVar("ScoreStateKind")
@@ -215,7 +215,9 @@ class FunctionReward(Reward):
     function: RewardFunction
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
-        return self.function(previous, centers, mask)
+        outcome = self.function(previous, centers, mask)
+        check_kinds({"what the reward gives": outcome}, {"what the reward gives": StepOutcome})
+        return outcome
 
 
 @typed(ValueError)

@@ -178,6 +178,7 @@ class WindowTable:
             indices = self._by_object_count[int(self._objects[self.starts[first]])]
         return indices[torch.randint(len(indices), (count,), generator=generator)]
 
+    @typed(ValueError)
     def batch(self, indices: Tensor) -> Window:
         """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`.
 
