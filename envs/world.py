@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from numbers import Real
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import gymnasium
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_kinds, check_number, told, typed
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -35,10 +36,10 @@ def finite_numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]
     raise ValueError(f"{name} must be {' or '.join(map(str, lengths))} finite numbers, not {values}")
 
 
-def known_options(options: Mapping[str, Any] | None, *names: str) -> Mapping[str, Any]:
-    """The options of a reset, `{}` for None; a ValueError if one has another name."""
-    if unknown := sorted(set(options or {}) - set(names)):
-        raise ValueError(f"unknown option {unknown[0]!r} of reset: choose from {', '.join(names)}")
+def known_options(options: Mapping[str, Any] | None, *names: str, of: str = "reset") -> Mapping[str, Any]:
+    """The options of a reset or the like, `{}` for None; a ValueError if one has another name."""
+    if unknown := sorted(set(options or {}) - set(names), key=str):
+        raise ValueError(f"unknown option {unknown[0]!r} of {of}: choose from {', '.join(names)}")
     return options or {}
 
 
@@ -171,6 +172,7 @@ class Goal(ABC):
     reads_features = True
     about = "all"
 
+    @typed(ValueError)
     def __init__(self, space: Space, *, weight: float = 0.0) -> None:
         check_number("weight", weight)
         self.space, self.weight = space, weight
@@ -227,28 +229,59 @@ def check_world(world: World) -> None:
         raise ValueError(f"{name}: its space has {space.actions} numbers in an action, and its action_space is {box}")
     if not (np.all(box.low == -1) and np.all(box.high == 1)):
         raise ValueError(f"{name}: its action_space must be a box from -1 to 1, not {box}")
-    state = world.state(world.reset(seed=0)[0])
+    state = observed_state(world, begin(world, 0))
     _check_state(world, state)
-    observation, earned, ended, _, info = world.step(np.zeros(space.actions, np.float32))
-    _check_state(world, world.state(observation))
-    if "success" not in info:
-        raise ValueError(f"{name}: info of a step must have success, and has {', '.join(info) or 'nothing'}")
-    if {type(ended), type(info["success"])} - {bool, np.bool_} or not math.isfinite(earned):
-        said = f"{earned}, {ended} and {info['success']}"
-        raise ValueError(f"{name}: a step must give a finite reward, terminated and success as bool, not {said}")
-    check_number(f"{name}: maximum_steps", world.maximum_steps, 1)
+    _check_state(world, observed_state(world, advance(world, np.zeros(space.actions, np.float32))[0]))
+    check_number(f"{name}: maximum_steps", world.maximum_steps, 1, whole=True)
     if len(world.names) != world.objects:
         raise ValueError(f"{name}: names must be one for each of its {world.objects} objects, not {world.names}")
-    plans = 5
+    check_goal(world, world.goal(), state)
+
+
+def begin(world: World, seed: int) -> Any:
+    """The observation of a reset; raises ValueError where a world gives something else."""
+    given = world.reset(seed=seed)
+    if not (isinstance(given, tuple) and len(given) == 2):
+        raise ValueError(f"{type(world).__name__}: reset must give an observation and info, not {told(given)}")
+    return given[0]
+
+
+def advance(world: World, action: NDArray[Any]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    """What a step gives; raises ValueError where it is not what `World` says."""
+    name, given = type(world).__name__, world.step(action)
+    if not (isinstance(given, tuple) and len(given) == 5 and isinstance(given[4], Mapping)):
+        wanted = "an observation, reward, terminated, truncated and info"
+        raise ValueError(f"{name}: a step must give {wanted}, not {told(given)}")
+    _, earned, ended, truncated, info = given
+    if "success" not in info:
+        raise ValueError(f"{name}: info of a step must have success, and has {', '.join(info) or 'nothing'}")
+    flags = {type(ended), type(truncated), type(info["success"])} <= {bool, np.bool_}
+    if not (flags and isinstance(earned, Real | Tensor) and math.isfinite(earned)):
+        said = f"{earned}, {ended}, {truncated} and {info['success']}"
+        raise ValueError(
+            f"{name}: a step must give a finite reward, and terminated, truncated and success as bool, not {said}"
+        )
+    return given
+
+
+def observed_state(world: World, observation: Any) -> State:
+    """The state of an observation; raises ValueError for something else."""
+    state = world.state(observation)
+    check_kinds({f"{type(world).__name__}: state": state}, {f"{type(world).__name__}: state": State})
+    return state
+
+
+def check_goal(world: World, goal: Any, state: State) -> None:
+    """Raise ValueError unless the goal of a world gives outcomes of states, here of copies of `state: []`."""
+    name, plans = type(world).__name__, 5
     one = state.map(lambda field: field.expand(plans, *field.shape))
-    goal = world.goal()
-    values = one.values(goal.reads_features)
     try:
+        values = one.values(getattr(goal, "reads_features", False))
         outcome = goal(values, values, one.mask)
     except (RuntimeError, TypeError, AttributeError) as error:
         raise ValueError(f"{name}: its goal does not fit states [{plans}]: {str(error).splitlines()[0]}") from error
     for field in ("success", "failure", "reward"):  # the reward is made of the others
-        value = getattr(outcome, field)
+        value = getattr(outcome, field, None)
         wanted, given = f"{'numbers' if field == 'reward' else 'bool'} [{plans}]", type(value).__name__
         if isinstance(value, Tensor):
             given = f"{'bool' if value.dtype == torch.bool else 'numbers'} {[*value.shape]}"

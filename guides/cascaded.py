@@ -8,14 +8,9 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import EffectTrunk
-from cavin_pyro.models.networks.layers import (
-    GaussianCode,
-    ObjectPool,
-    fully_connected,
-)
+from cavin_pyro.models.networks.layers import GaussianCode, ObjectPool, fully_connected
 from cavin_pyro.models.state import State, Window
 
 
@@ -30,7 +25,7 @@ class CascadedGuide(Guide):
 
     def __init__(
         self,
-        model: CascadedModel,
+        model: Model,
         *,
         width: int = 64,
         effect_reads_actions: bool = False,

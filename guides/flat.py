@@ -6,8 +6,7 @@ import pyro
 
 from cavin_pyro.guides.cascaded import MotionInference
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.flat import FlatModel
-from cavin_pyro.models.model import sequence_mask, windows_plate
+from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.state import Window
 
 
@@ -19,7 +18,7 @@ class FlatGuide(Guide):
 
     fits = ("flat",)
 
-    def __init__(self, model: FlatModel, *, width: int = 64) -> None:
+    def __init__(self, model: Model, *, width: int = 64) -> None:
         """The inference network; for the arguments see `Guide`."""
         super().__init__(model)
         self.motion_inference = MotionInference(model, width=width, reads_effect=False)

@@ -6,7 +6,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
 from cavin_pyro.guides.cascaded import CascadedGuide
-from cavin_pyro.models.cascaded import CascadedModel
+from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.flows import CodeFlow
 
 
@@ -34,7 +34,7 @@ class FlowGuide(CascadedGuide):
     The flows start as the identity, so before training this guide equals `CascadedGuide`.
     """
 
-    def __init__(self, model: CascadedModel, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
+    def __init__(self, model: Model, *, width: int = 64, flow_width: int = 32, transforms: int = 4) -> None:
         """The inference networks and their flows. For `model` see `Guide`.
 
         Args:

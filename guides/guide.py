@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from cavin_pyro.models.checks import typed
 from cavin_pyro.models.model import Model, Program
 from cavin_pyro.models.state import Window
 
@@ -25,13 +26,14 @@ class Guide(Program):
     def __init__(self, model: Model) -> None:
         """Raises `ValueError` for an incompatible model."""
         super().__init__()
-        if not isinstance(model, Model) or model.name not in self.fits:
+        if model.name not in self.fits:
             raise ValueError(
                 f"guide {type(self).__name__} does not fit model {type(model).__name__}; it fits {', '.join(self.fits)}"
             )
         # In a tuple, so that the model's parameters are not registered (and saved) in the guide as well.
         self._model = (model,)
 
+    @typed(ValueError)
     def __call__(self, window: Window) -> Any:
         """Infer the codes of whole windows. Raises `ValueError` for initial ones."""
         if not window.whole:

@@ -6,8 +6,7 @@ import pyro
 
 from cavin_pyro.guides.cascaded import EffectInference
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.model import sequence_mask, windows_plate
-from cavin_pyro.models.single_latent import SingleLatentModel
+from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.state import Window
 
 
@@ -22,7 +21,7 @@ class SingleLatentGuide(Guide):
 
     fits = ("single_latent",)
 
-    def __init__(self, model: SingleLatentModel, *, width: int = 64, reads_actions: bool = False) -> None:
+    def __init__(self, model: Model, *, width: int = 64, reads_actions: bool = False) -> None:
         """The inference network. For `model` and `width` see `Guide`.
 
         Args:

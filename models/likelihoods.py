@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import torch
 from pyro import distributions
 from pyro.distributions import TorchDistribution, constraints
 from torch import Tensor, nn
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_kinds, check_number
 from cavin_pyro.models.part import Part
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -76,6 +76,7 @@ class LikelihoodScales(Scales):
     action: Sequence[float] | None = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        check_kinds(vars(self), get_type_hints(type(self)))
         for name, value in _filled(self.space, self.center, self.feature, self.action).items():
             object.__setattr__(self, name, value)
 
@@ -92,6 +93,12 @@ class PredictedScales(LikelihoodScales):
 
     degrees_of_freedom: float = 3.0
     height_ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        IsotropicStudentT(
+            self.degrees_of_freedom, torch.zeros(1), torch.ones(()), self.height_ratio
+        )  # raises its errors
 
     def _around(
         self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None, *, of_centers: bool = False

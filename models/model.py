@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pyro
+import torch
 from pyro import poutine
 from pyro.distributions import TorchDistribution
+from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import told, typed
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
@@ -100,10 +102,7 @@ class Model(Program):
         self.feature_dimension = feature_dimension
         self.width = width
         self.maximum_objects = maximum_objects
-        for name in ("segment_length", "feature_dimension", "width", "maximum_objects"):
-            check_number(name, getattr(self, name), 1, whole=True)
         self.neighbours = maximum_objects - 1 if neighbours is None else neighbours
-        check_number("neighbours", self.neighbours, whole=True)
         self.scales = scales or LikelihoodScales(space)
         sizes = {"feature_dimension": feature_dimension, "width": width}
         self.encoder = StateEncoder(space, neighbours=self.neighbours, **sizes)
@@ -124,10 +123,31 @@ class Model(Program):
         """See `cavin_pyro.models.networks.layers`: for planners that compile."""
         return fixed_shapes()
 
+    def check_priors(self) -> None:
+        """Raise ValueError unless each code has a prior that gives distributions of it, here for a scene `[1]`."""
+        one = next(self.parameters()).new_zeros
+        state = State(
+            one(1, 1, self.space.positions), one(1, 1, self.feature_dimension), one(1, 1).bool().logical_not()
+        )
+        for code in self.codes:
+            name = code.replace("code", "prior")
+            if not hasattr(self, name):  # which planners need, not trainings
+                continue
+            effect = [one(1, getattr(self, "effect_dimension", 0))] if code == "motion_code" else []
+            with torch.no_grad(), torch.random.fork_rng(devices=[]):
+                made = getattr(self, name)(state, *effect)
+            wanted = [1, getattr(self, code.replace("code", "dimension"))]
+            known = isinstance(made, TorchDistributionMixin)
+            if not known or [*made.batch_shape, *made.event_shape] != wanted:
+                given = f"{type(made).__name__} {[*made.batch_shape]} {[*made.event_shape]}" if known else told(made)
+                said = f"{name} must give, for a scene [1], a distribution of Pyro with batch and event shape"
+                raise ValueError(f"{said} [1] {wanted[1:]}, not {given}")
+
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., A]` -> the state after one action."""
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
+    @typed(ValueError)
     def encode(self, window: Window) -> Tensor:
         """State features of `window: [B]`: `[B, T, M, 3 * width]`, or `[B, 1, M, 3 * width]` of the first states.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
@@ -230,6 +230,7 @@ class CavinWithoutEffectsPlanner(ActionSearch):
     has_codes = True
 
 
+@runtime_checkable
 class Policy(Protocol):
     """What acts without predicting, such as a script that belongs to a world."""
 
@@ -245,6 +246,7 @@ class PolicyPlanner:
 
     segment_length = 1
 
+    @typed(ValueError)
     def __init__(self, policy: Policy, *, action_dimension: int) -> None:
         self.policy, self.action_dimension = policy, action_dimension
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.models.state import State
 
 
@@ -42,10 +42,11 @@ def check_horizon(horizon: int, segment_length: int) -> None:
         )
 
 
+@typed(ValueError)
 def check_scenes(state: State, generators: Sequence[torch.Generator], steps_left: int | None = None) -> None:
     """Raise ValueError unless `state` is a batch `[B]`, each finite and with an object and a generator of its own."""
     centers = state.centers
-    check_number("steps_left", 1 if steps_left is None else steps_left, 1)
+    check_number("steps_left", 1 if steps_left is None else steps_left, 1, whole=True)
     if centers.ndim != 3 or state.mask.shape != centers.shape[:-1] or not len(centers):
         raise ValueError(
             "a planner takes states of at least one scene, with centers [B, M, P] and mask [B, M], "

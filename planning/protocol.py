@@ -16,11 +16,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from cavin_pyro.models.checks import check_kinds, typed
 from cavin_pyro.models.state import State
 
 ScoreStateKind = TypeVar("ScoreStateKind")
 
 
+@runtime_checkable
 class TransitionModel(Protocol):
     """The dynamics f alone (paper, equation 1), of which planners take the mean.
 
@@ -160,6 +162,7 @@ class RemainingDistance(Protocol):
         """An upper bound on what is left with the objects in `mask: [..., M]`: `[...]`."""
 
 
+@runtime_checkable
 class RewardFunction(Protocol):
     """R(s_{t+1}) of the paper (section 2); it also takes the state before, for rewards of progress."""
 
@@ -212,12 +215,15 @@ class FunctionReward(Reward):
     function: RewardFunction
 
     def __call__(self, previous: Tensor, centers: Tensor, mask: Tensor) -> StepOutcome:
-        return self.function(previous, centers, mask)
+        outcome = self.function(previous, centers, mask)
+        check_kinds({"what the reward gives": outcome}, {"what the reward gives": StepOutcome})
+        return outcome
 
 
-def as_reward(function: RewardFunction) -> Reward:
+@typed(ValueError)
+def as_reward(reward: RewardFunction) -> Reward:
     """A reward function itself, or with the defaults of `Reward` if it has no more than its call."""
-    return function if isinstance(function, Reward) else FunctionReward(function)
+    return reward if isinstance(reward, Reward) else FunctionReward(reward)
 
 
 class Query(NamedTuple):

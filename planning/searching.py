@@ -11,17 +11,12 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_choice, check_number
+from cavin_pyro.models.checks import check_choice, check_number, typed
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions import Addition, make_additions
 from cavin_pyro.planning.backends import make_backend
-from cavin_pyro.planning.checks import (
-    NoFiniteCandidateError,
-    OptimizerError,
-    check_horizon,
-    check_scenes,
-)
+from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, check_horizon, check_scenes
 from cavin_pyro.planning.optimizers import Optimizer, make_optimizer
 from cavin_pyro.planning.protocol import (
     FixedShapes,
@@ -70,6 +65,7 @@ class SearchingPlanner(ABC):
     requires: ClassVar[ModelRequirements]  # of the planner on its model
     hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank")  # of `Addition`, which the planner calls
 
+    @typed(ValueError)
     def __init__(
         self,
         model: TransitionModel,
@@ -85,6 +81,7 @@ class SearchingPlanner(ABC):
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names."""
         check_number("samples", samples, 1, whole=True)
+        check_number("decimals", 1 if decimals is None else decimals, 1)
         check_horizon(horizon, model.segment_length)
         check_choice("reward_at", reward_at, REWARD_AT)
         self.optimizer = make_optimizer(optimizer, samples=samples)

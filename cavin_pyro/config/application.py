@@ -35,6 +35,7 @@ else:
 
 # docs/reliability.md
 RESUMING = ("collect", "pretrain", "train", "evaluate", "check", "reproduce", "quickstart", "assets")
+TO = ("assets", "data")  # take --to DIR instead of output=DIR
 _TAKEN = {errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENODEV}  # the last: to map a folder
 _DENIED = {errno.EACCES, errno.EPERM}
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG, *_DENIED, *_TAKEN}
@@ -123,7 +124,7 @@ def guarded(action: Callable[[], T], name: str | None = None, words: Sequence[st
         line = _line(error, words)
         if line is None or "--traceback" in sys.argv:
             raise
-        _stop(line, getattr(error, "status", 2))
+        _stop(line.replace("output=DIR", "--to DIR") if name in TO else line, getattr(error, "status", 2))
 
 
 def _line(error: Exception, words: Sequence[str]) -> str | None:
@@ -132,14 +133,14 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
         said = f"{error}{'; --traceback shows where' if error.unclear else ''}"
         sections = {section.partition(".")[0] for section in error.sections}
         given = [word for word in words if re.split(r"[./=]", word.lstrip("+"))[0] in sections]
-        about, places = given if error.__cause__ else [], dict[int, str]()
+        places = dict[int, str]()
         for key, _, value in (word.lstrip("+").partition("=") for word in given):
             if key in said:
                 return said
             own = f"|{re.escape(value)}" if len(value) > 3 else ""
-            if found := re.search(rf"\b{re.split('[./]', key)[-1]}\b{own}", said):
+            if found := re.search(rf"\b{re.split('[./]', key.removesuffix('._target_'))[-1]}\b{own}", said):
                 places[found.start()] = f"{key}={value}"
-        about = [places[min(places)]] if places else about  # what is wrong is named before what it would take
+        about = [places[min(places)]] if places else given if error.unclear else []  # first what is wrong, then others
         return f"{', '.join(about)}: {said}" if about else said
     if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
         return _refusal(error)

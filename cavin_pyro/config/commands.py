@@ -139,7 +139,7 @@ class TrainerConfig:
 class WindowConfig:
     """Selection of windows and transitions for training (section `windows`; the published implementation)."""
 
-    validation_fraction: float = option(0.1, "share of the episodes held out for validation", minimum=0, maximum=1)
+    validation_fraction: float = option(0.1, "share of the episodes for validation", positive=True, maximum=0.99)
     maximum_step: float = option(0.2, "most that an object moves in a transition for f", unit="metres", positive=True)
     minimum_move: float = option(0.1, "least move of a window's farthest object, for h, g", unit="metres", minimum=0)
     maximum_move: float = option(0.5, "largest such move; all pushes are also safe", unit="metres", minimum=0)

@@ -26,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from cavin_pyro.config.commands import COMMANDS
 from cavin_pyro.config.errors import UserError, one_line
 from cavin_pyro.config.options import check_options, flat_options, options, shown, with_defaults
+from cavin_pyro.models.checks import told
 
 PRESETS = Path(__file__).parent / "presets"
 OUTPUT = {  # the folder of a run for which the user names none
@@ -74,6 +75,8 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
     register(name)
     words = [f"hydra.searchpath=['file://{Path(config_dir).resolve()}']"] if config_dir else []
     words += rewritten(overrides, plans=hasattr(COMMANDS[name], "planner"))
+    for group, _, choice in (word.partition("=") for word in words if config_dir):
+        _check_preset(Path(config_dir or "", group, f"{choice}.yaml"))
     running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None  # also within a sweep
     try:
         with hydra.initialize(version_base="1.3", config_path=None):
@@ -85,6 +88,17 @@ def composed(name: str, overrides: Sequence[str], config_dir: str | None = None)
                 raise UserError(re.sub(r"\bworld(?=\.)|(?<= under )world\b", own, said)) from error
     finally:
         GlobalHydra.instance().hydra = running
+
+
+def _check_preset(path: Path) -> None:
+    """Raise a `UserError` for a preset of the user's that holds no options."""
+    if path.is_file():
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (yaml.YAMLError, ValueError) as error:
+            raise UserError(f"{path} is not YAML: {one_line(error)}") from error
+        if not isinstance(content, dict):
+            raise UserError(f"{path} must hold options, NAME: VALUE, with _target_: the class, not {told(content)}")
 
 
 @functools.cache
@@ -204,6 +218,8 @@ def _of_other_world(overrides: Sequence[str], *, plans: bool) -> list[str]:
         key, _, value = word.lstrip("+").partition("=")
         if key.partition(".")[0] in OF_TABLETOP:
             raise UserError(f"{key} is an option of env=tabletop: leave it out, or give one of env.* with {chosen}")
+        if key in ("env", "env._target_") and word != chosen:
+            raise UserError(f"{chosen} and {word}: choose one env")
         if key.startswith("env."):
             word = f"{'++' if own else ''}world.{key.removeprefix('env.')}={value}"
         if word != chosen:
@@ -278,6 +294,8 @@ def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
     if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
         return _unknown(name, key, known)
     first = str(error.__cause__ or error).splitlines()[0]
+    if entry := re.fullmatch("Key '(.+)' is not in struct", first):
+        return _unknown(name, f"{key}.{entry[1]}", known)
     if first.startswith("Could not override") and "/" in key:
         section, _, part = key.rpartition("/")
         return f"{word}: the chosen {section} has no {part}: leave it out, or choose another {section}"

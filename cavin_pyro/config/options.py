@@ -22,7 +22,7 @@ from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, ListConfi
 from omegaconf.errors import OmegaConfBaseException
 
 from cavin_pyro.config.errors import UserError, user_input
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, parameters_of
 
 T = TypeVar("T")
 MAXIMUM_SEED = 2**32 - 1  # the largest that all random generators accept
@@ -110,18 +110,21 @@ def check_options(schema: type, config: Mapping[str, Any], prefix: str = "") -> 
             value = value[part]
         if isinstance(value, list) and one.kind is not Any and any(isinstance(entry, list | dict) for entry in value):
             raise UserError(f"{prefix}{one.name} must be a plain list such as [a,b], not {value}")
-        if value is not None:
-            check_value(f"{prefix}{one.name}", value, one.about)
+        if value is not None or (one.kind is Any and one.about.choices):
+            check_value(f"{prefix}{one.name}", value, one.about, listed=one.kind is not Any)
 
 
-def check_value(name: str, value: Any, about: About) -> None:
-    """Raise a `UserError` for a value that is out of its range, or none of the choices; the line states them."""
+def check_value(name: str, value: Any, about: About, *, listed: bool = True) -> None:
+    """Raise a `UserError` for a value that is out of its range, or none of the choices; the line states them.
+
+    `listed`: whether it may be a list of choices.
+    """
     if isinstance(value, Mapping) and value.get("_target_"):
         return  # a class of the user's, which says itself what is wrong with it
     if about.choices is not None:
         if value == []:
             raise UserError(f"{name} must name at least one: choose from {', '.join(about.names or ())}")
-        for entry in value if isinstance(value, list) else [value]:
+        for entry in value if isinstance(value, list) and listed else [value]:
             if str(entry) not in (about.names or ()):
                 raise UserError(f"unknown {name} {entry!r}: choose from {', '.join(about.names or ())}")
         return
@@ -192,20 +195,7 @@ def constructor_options(target: str) -> dict[str, inspect.Parameter]:
         found = get_object(target)
     except (Exception, SystemExit):  # a user's module may raise anything; building the part says it in one line
         return {}
-    constructors = [found]
-    if inspect.isclass(found):
-        constructors = [vars(one)["__init__"] for one in found.__mro__ if "__init__" in vars(one)]
-    options: dict[str, inspect.Parameter] = {}
-    for constructor in constructors:
-        if not inspect.isfunction(constructor) or constructor.__module__.partition(".")[0] != "cavin_pyro":
-            break
-        hints, parameters = get_type_hints(constructor), inspect.signature(constructor).parameters.values()
-        for one in parameters:
-            if one.kind in (one.POSITIONAL_OR_KEYWORD, one.KEYWORD_ONLY) and one.name != "self":
-                options.setdefault(one.name, one.replace(annotation=hints.get(one.name, Any)))
-        if not any(one.kind is one.VAR_KEYWORD for one in parameters):
-            break
-    return options
+    return parameters_of(found, "cavin_pyro.")
 
 
 def is_shown(one: inspect.Parameter) -> bool:

@@ -13,16 +13,21 @@ import yaml
 from hydra.errors import InstantiationException
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig
+from torch import nn
 
 from cavin_pyro.config.composition import PRESETS
 from cavin_pyro.config.errors import UserError, one_line, user_input
-from cavin_pyro.config.options import constructor_options
+from cavin_pyro.config.options import constructor_options, shown
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.guides.guide import Guide
+from cavin_pyro.models.checks import check_kinds
+from cavin_pyro.models.likelihoods import Scales
 from cavin_pyro.models.model import Model
+from cavin_pyro.models.networks.dynamics import Outcome
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.part import Part
 
+KINDS = {"model": Model, "prior": nn.Module, "dynamics": Outcome, "scales": Scales, "autoencoder": nn.Module}
 PARTS = ("model", "guide", "prior", "geometry", "dynamics", "scales", "objective")  # sections of a training
 Config = Mapping[str, Any] | DictConfig
 STANDARD_PRIOR = "cavin_pyro.models.priors.standard.StandardPrior"
@@ -32,13 +37,20 @@ FIXED_SCALES = {"_target_": "cavin_pyro.models.likelihoods.LikelihoodScales"}
 PAPER_DYNAMICS = {"_target_": "cavin_pyro.models.networks.dynamics.Dynamics"}
 
 
-def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
-    """Build the part that a configuration names; whatever its class raises becomes a `UserError` of one line."""
+def construct(config: Config, *arguments: Any, kind: type = object, **keywords: Any) -> Any:
+    """Build the part that a configuration names; whatever its class raises becomes a `UserError` of one line.
+
+    So does a part of another `kind`, a class, or a protocol with its methods.
+    """
     if not config.get("_target_"):
         raise UserError(f"a part has no _target_, the class to build it from: {dict(config)}")
     try:
-        # In two steps, because Hydra would turn keywords that are dataclasses into configuration.
-        return instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
+        if (own := class_of(config)) is None or _is_a(own, kind):
+            # In two steps, because Hydra would turn keywords that are dataclasses into configuration.
+            own = instantiate(config, _partial_=True, _convert_="all")(*arguments, **keywords)
+            if _is_a(own, kind):
+                return own
+        raise UserError(f"{config['_target_']} is no {kind.__name__}: derive it from {kind.__module__}.{kind.__name__}")
     except UserError:
         raise
     except (Exception, SystemExit) as error:
@@ -47,8 +59,20 @@ def construct(config: Config, *arguments: Any, **keywords: Any) -> Any:
         raise UserError(said + one_line(cause)) from error
 
 
+def _is_a(made: Any, kind: type) -> bool:
+    """Whether a class, or an object, is one of a kind, or has a protocol's methods."""
+    if getattr(kind, "_is_protocol", False):
+        methods = [name for name, one in vars(kind).items() if inspect.isfunction(one) and not name.startswith("_")]
+        return all(hasattr(made, name) for name in methods)
+    return issubclass(made, kind) if isinstance(made, type) else isinstance(made, kind)
+
+
 def check_sizes(section: str, config: Config, minimum: float = 1) -> None:
     """Raise a `UserError` for a number that is not finite, or a whole one out of range, but for those that may be 0."""
+    if not isinstance(config, Mapping | DictConfig):
+        raise UserError(
+            f"{section} is a section of options, {section}.NAME=VALUE, which {shown(config)} cannot replace"
+        )
     for name, value in config.items():
         option = f"{section}.{name!s}"
         if isinstance(value, Mapping | DictConfig):
@@ -65,7 +89,7 @@ def build_part(section: str, config: Config, *arguments: Any, **keywords: Any) -
     """Build the part of a section, which the line about what is wrong with it names."""
     check_sizes(section, config)
     with user_input(section):
-        return construct(config, *arguments, **keywords)
+        return construct(config, *arguments, kind=KINDS.get(section.rpartition(".")[2], object), **keywords)
 
 
 @user_input("model", "prior", "scales", "dynamics")
@@ -77,6 +101,7 @@ def build_model(config: Config) -> Model:
     `model` itself has the parts, as `describe` writes it. A part that cannot be built is a `UserError`. The section
     `space` is the world's; without it, the tabletop's.
     """
+    check_kinds(config, dict.fromkeys(("space", *PARTS), Mapping | None))
     sizes, parts, kinds = dict(config["model"]), dict[str, Any](), list[str]()
     if "prior" in config:
         if missing := [name for name in ("_target_", "feature_dimension", "width") if name not in sizes]:
@@ -95,9 +120,8 @@ def build_model(config: Config) -> Model:
         parts["dynamics"] = build_part("dynamics", config.get("dynamics") or PAPER_DYNAMICS, **given)
         parts["scales"] = build_part("scales", config.get("scales") or FIXED_SCALES, space=space)
         parts["space"] = space
-    model = build_part("model", sizes, **parts)
-    if not isinstance(model, Model):
-        raise UserError(f"model {type(model).__name__} is no program: derive it from cavin_pyro.models.model.Model")
+    model: Model = build_part("model", sizes, **parts)
+    model.check_priors()
     if "prior" in config and not kinds and config["prior"].get("_target_") != STANDARD_PRIOR:
         raise UserError(f"model {type(model).__name__} has no codes and so no priors: leave prior=standard")
     return model

@@ -45,9 +45,7 @@ def world_of(config: Mapping[str, Any] | DictConfig) -> World | None:
     if not section.get("_target_"):
         return None
     with user_input("env"):
-        world = construct(section)
-        if not isinstance(world, World):
-            raise ValueError(f"env {type(world).__name__} is no world: derive it from cavin_pyro.envs.world.World")
+        world: World = construct(section, kind=World)
         check_world(world)
     return world
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.criticism.subgoals import execute
 from cavin_pyro.envs.tabletop.workspace import SPACE
-from cavin_pyro.envs.world import World
+from cavin_pyro.envs.world import World, begin
 from cavin_pyro.models.model import Model
 from cavin_pyro.planning import rollout
 from cavin_pyro.planning.sampling import sample_codes
@@ -73,7 +73,7 @@ def imagine(model: Model, world: World, *, seed: int = 0, effects: int = 8, moti
         raise UserError(
             f"imagine needs a checkpoint of model=cascaded, which has effect and motion codes, not {model.name}"
         )
-    observation, _ = world.reset(seed=seed)
+    observation = begin(world, seed)
     picture, (centers, mask) = world.render(), world.positions(observation)
     state = world.state(observation).expand_plans(1)
     generators = [torch.Generator().manual_seed(seed)]

@@ -29,7 +29,7 @@ from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.pushing import state_of
 from cavin_pyro.envs.tabletop.scene import Scene
 from cavin_pyro.envs.tabletop.workspace import SPACE
-from cavin_pyro.envs.world import World
+from cavin_pyro.envs.world import World, advance, begin
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -180,7 +180,7 @@ def execute(world: World, actions: Floats, *, to_the_end: bool = False) -> tuple
     """
     path, over = [], False
     for action in actions:
-        observation, _, ended, *_ = world.step(np.clip(action, -1.0, 1.0))
+        observation, _, ended, *_ = advance(world, np.clip(action, -1.0, 1.0))
         path.append(world.positions(observation)[0])
         over = over or ended
         if over and not to_the_end:
@@ -194,7 +194,7 @@ def _rollout(
     """In one scene, or in one episode of another world than the tabletop; places of padding are zeros."""
     seed, reports = [context.seed, number], []
     if isinstance(simulator, World):
-        observation, _ = simulator.reset(seed=_number(seed))
+        observation = begin(simulator, _number(seed))
         before, mask = simulator.positions(observation)
         state = simulator.state(observation)
     else:

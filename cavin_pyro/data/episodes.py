@@ -16,7 +16,7 @@ from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.world import world_of
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.randomness import collection_streams
-from cavin_pyro.envs.world import World
+from cavin_pyro.envs.world import World, advance, begin, observed_state
 from cavin_pyro.models.space import Space
 
 
@@ -65,12 +65,12 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """
     scene, choices = collection_streams(seed, number)
     policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
-    observation, _ = world.reset(seed=int(scene.integers(2**32)))
-    states, actions, ended = [world.state(observation)], list[Any](), False
+    observation = begin(world, int(scene.integers(2**32)))
+    states, actions, ended = [observed_state(world, observation)], list[Any](), False
     while len(actions) < steps and not ended:
         actions.append(np.array(policy.act(observation), np.float32))
-        observation, _, terminated, truncated, _ = world.step(actions[-1])
-        states.append(world.state(observation))
+        observation, _, terminated, truncated, _ = advance(world, actions[-1])
+        states.append(observed_state(world, observation))
         ended = terminated or truncated
     return of_states(world, states, actions)
 

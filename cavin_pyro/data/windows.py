@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +22,7 @@ from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.data.episodes import checked_episode, packed
 from cavin_pyro.data.features import find_held_out, geometry_fingerprint, held_out, shard_features
 from cavin_pyro.data.finding import WindowFinder
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
@@ -111,12 +111,11 @@ class WindowTable:
             check_number("negative_fraction", negative_fraction, high=1)
             check_number("validation_fraction", validation_fraction, high=0.99, positive=True)
             check_number("seed", seed, high=MAXIMUM_SEED, whole=True)
-            parts = [centers, features, actions, [None] * len(actions) if mask is None else mask]
-            if not all(hasattr(part, "__len__") for part in parts):
-                raise UserError("centers, features, actions and mask must be lists or arrays")
-            if not isinstance(space, Space) or len({*map(len, parts)}) > 1:
-                given = f"{type(space).__name__} and {', '.join(str(len(part)) for part in parts)}"
-                raise UserError(f"give a Space, and as many centers, features, actions and masks, not {given}")
+            parts: list[Any] = [centers, features, actions, *([] if mask is None else [mask])]
+            counts = [str(len(part)) if isinstance(part, Sized) else type(part).__name__ for part in parts]
+            if not isinstance(space, Space) or len({*counts}) > 1 or not counts[0].isdecimal():
+                given = f"{type(space).__name__} and {', '.join(counts)}"
+                raise UserError(f"give a Space, and as many centers, features, actions and masks in lists, not {given}")
             episodes: list[Arrays] = []
             sizes: dict[str, int] = {}  # of the first
             for number, one in enumerate(zip(*parts, strict=True)):
@@ -179,6 +178,7 @@ class WindowTable:
             indices = self._by_object_count[int(self._objects[self.starts[first]])]
         return indices[torch.randint(len(indices), (count,), generator=generator)]
 
+    @typed(ValueError)
     def batch(self, indices: Tensor) -> Window:
         """The windows `indices: [B]` int64, on the CPU, without padding that none of them needs, on `device`.
 
@@ -199,6 +199,7 @@ class WindowTable:
         return window.map(lambda field: send(field, self.device))
 
 
+@typed(UserError)
 def load_windows(
     folders: Sequence[Path],
     geometry: Geometry | None,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -25,13 +25,13 @@ from cavin_pyro.envs.tabletop.tasks import GeneratedLayouts
 from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.envs.world import ACTION_DECIMALS, World
 from cavin_pyro.evaluation.rollout import Episode, rollout
-from cavin_pyro.models.checks import typed
+from cavin_pyro.models.checks import check_choice, check_kinds, parameters_of, typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.planning import Planner
 from cavin_pyro.planning.additions import ADDITIONS, Addition
 from cavin_pyro.planning.backends import GRAPHS
-from cavin_pyro.planning.optimizers import Shooting
+from cavin_pyro.planning.optimizers import Optimizer, Shooting
 from cavin_pyro.planning.searching import SearchingPlanner
 from cavin_pyro.storage.checkpoint import Checkpoint, load
 
@@ -159,7 +159,7 @@ def planner_of(
         optimizers, additions = _optimizers(options), _additions(options, one_push=config.pushes_per_plan == 1)
         given = {"model": model, "additions": additions, "decimals": config.get("push_decimals"), **optimizers}
     with user_input("planner"):
-        planner: Planner = construct(options, **given)
+        planner: Planner = construct(options, kind=Planner, **given)
         if config.pushes_per_plan is not None:  # a plan has as many pushes as are to be executed
             check_value("pushes_per_plan", config.pushes_per_plan, About("", minimum=1, maximum=planner.segment_length))
     return planner
@@ -202,23 +202,24 @@ def check_space(trained: Checkpoint, env: World) -> None:
         )
 
 
+@user_input("planner")
 def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:
     """Take the additions out of a planner's options, and build them.
 
     `planner.add` adds more, of which one replaces another of its class, and `planner.drop` leaves some out.
     """
-    given = (options.pop(name, None) or [] for name in ("additions", "add", "drop"))
-    listed, more, dropped = ([names] if isinstance(names, str) else list(names) for names in given)
-    names = [name for name in (*listed, *more) if not isinstance(name, Mapping | Addition)] + dropped
-    unknown = [name for name in map(str, names) if name not in ADDITIONS]
-    if unknown:
-        raise UserError(f"unknown addition '{unknown[0]}': choose from {', '.join(ADDITIONS)}, or give a _target_")
+    kinds = {"additions": Sequence[str | Mapping], "add": Sequence[str | Mapping], "drop": Sequence[str]}
+    given = {name: options.pop(name, None) or [] for name in kinds}
+    given = {name: [one] if isinstance(one, str) else one for name, one in given.items()}
+    check_kinds(given, kinds)
+    for name in itertools.chain(*given.values()):
+        if isinstance(name, str):
+            check_choice("addition", name, ADDITIONS)
     made: dict[type, Addition] = {}
-    for entry in (*listed, *more):
-        with user_input("planner"):
-            addition = ADDITIONS[entry]() if isinstance(entry, str) else construct(entry)
+    for entry in (*given["additions"], *given["add"]):
+        addition = ADDITIONS[entry]() if isinstance(entry, str) else construct(entry, kind=Addition)
         made[type(addition)] = addition
-    for name in dropped:
+    for name in given["drop"]:
         if made.pop(ADDITIONS[name], None) is None:
             raise UserError(f"planner.drop=[{name}]: this planner has no such addition")
     return [addition for addition in made.values() if one_push or not getattr(addition, "for_one_push", False)]
@@ -235,11 +236,10 @@ def _optimizers(options: dict[str, Any]) -> dict[str, Any]:
     for name in ("optimizer", "motion_optimizer"):
         section = options.get(name)
         if isinstance(section, DictConfig):
-            own = class_of(section)
-            taken = inspect.signature(own).parameters if callable(own) else usual
+            taken = parameters_of(class_of(section))
             given = {str(key): value for key, value in section.items() if key in taken or key not in usual}
             with user_input("planner"):
-                built[name] = construct(given)
+                built[name] = construct(given, kind=Optimizer)
             del options[name]
     return built
 

@@ -16,7 +16,7 @@ from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, refused, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
-from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World
+from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World, advance, begin, check_goal, observed_state
 from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, UnsuitedError
@@ -193,7 +193,7 @@ def rollout(
 
     env.on_frame = on_frame if callbacks else None
     with refusals(seed, env):
-        observation = env.reset(seed=seed)[0] if start is None else start
+        observation = begin(env, seed) if start is None else start
         goal = env.goal(device)
     for callback in callbacks:
         callback.on_observation(observation)
@@ -201,7 +201,10 @@ def rollout(
     while not ended:
         began = time.perf_counter()
         with refusals(seed, env):
-            state = env.state(observation).map(lambda field: field.unsqueeze(0).to(device))
+            seen = observed_state(env, observation).map(lambda field: field.to(device))
+            if not episode.plan_records:
+                check_goal(env, goal, seen)
+            state = seen.map(lambda field: field.unsqueeze(0))
             shown = env.observed(observation)
         shown = shown and apply(shown, lambda field: field.to(device))
         with refusals(seed, env), refusals(seed, planner):  # the user's may be a task, which the planner asks
@@ -231,7 +234,7 @@ def rollout(
             raise UserError(f"pushes_per_plan must be between 1 and {len(actions)}, not {pushes_per_plan}")
         for number, action in enumerate(actions[:pushes_per_plan]):
             with refusals(seed, env):
-                observation, earned, terminated, truncated, info = env.step(action)
+                observation, earned, terminated, truncated, info = advance(env, action)
                 centers, _ = env.positions(observation)
             last = number == len(actions) - 1
             ends = info if "violation" in info else {**info, "violation": terminated and not info["success"]}

@@ -89,7 +89,7 @@ class Checkpoint:
             return None
         if section.get("_target_", POINTNET) == POINTNET:
             return self.pointnet
-        return self._filled("geometry", checked_geometry(construct(section)))
+        return self._filled("geometry", construct(section, kind=Geometry))
 
     @cached_property
     def pointnet(self) -> PointNet:
@@ -120,14 +120,6 @@ class Checkpoint:
                 types = f"{have.dtype}, not {want.dtype}".replace("torch.", "")
                 raise UserError(f"checkpoint {self.path} is damaged: {part}.{name} holds {types}")
         module.load_state_dict(weights)
-
-
-def checked_geometry(geometry: Any) -> Geometry:
-    """What a section `geometry` has built; a `UserError` if it is something else."""
-    if not isinstance(geometry, Geometry):
-        name = type(geometry).__name__
-        raise UserError(f"geometry {name} is no Geometry: derive it from cavin_pyro.models.networks.geometry")
-    return geometry
 
 
 @typed(UserError)
@@ -183,7 +175,7 @@ def save(
         for name, part in (("model", model), ("guide", inferring), ("geometry", geometry)):
             _ = part is None or getattr(made, name)
     about = {"config": stored, "provenance": of_this_process() if provenance is None else provenance}
-    with user_input():
+    with user_input(where="config and provenance must be plain data"):
         header = {name: json.dumps(part) for name, part in about.items()}
     header |= {"format": FORMAT, "version": str(FORMAT_VERSION), "sha256": tensors_digest(tensors)}
     with atomic_write(Path(path)) as temporary:  # `save_file` would hide the error of a full disk

@@ -9,7 +9,7 @@ from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.parts import PARTS, Config, construct
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
-from cavin_pyro.storage.checkpoint import POINTNET, checked_geometry, load
+from cavin_pyro.storage.checkpoint import POINTNET, load
 
 
 @user_input(*PARTS)
@@ -42,6 +42,6 @@ def chosen_geometry(config: Config) -> tuple[Geometry, dict[str, Any]]:
     if config["geometry"].get("_target_") != POINTNET:
         if config["pointnet"] != DEFAULT_CHECKPOINT:
             raise UserError(f"pointnet={config['pointnet']} is of geometry=pointnet: add that, or leave pointnet")
-        return checked_geometry(construct(config["geometry"])).requires_grad_(False).eval(), {}
+        return construct(config["geometry"], kind=Geometry).requires_grad_(False).eval(), {}
     trained = load(config["pointnet"])
     return trained.pointnet, {"pointnet": trained.provenance.get("pointnet", trained.provenance)}

@@ -12,7 +12,7 @@ from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
 
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.checks import check_number
+from cavin_pyro.models.checks import check_number, typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.bounds import DifferentiableBound, loss_with_gradients
@@ -43,6 +43,7 @@ class Objective:
     Raises ValueError: a number out of range, an unknown code, or weights of a bound that they would break.
     """
 
+    @typed(ValueError)
     def __init__(
         self,
         elbo: ELBO,
@@ -52,8 +53,6 @@ class Objective:
         counterfactual_weight: float = 0.0,
         rollout_weight: float = 0.0,
     ) -> None:
-        if not isinstance(elbo, ELBO):
-            raise ValueError(f"objective.elbo must be an ELBO of Pyro, such as Trace_ELBO, not {type(elbo).__name__}")
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
@@ -166,14 +165,10 @@ class _Weighted(Messenger):
             msg["scale"] = msg["scale"] * self._weights[msg["name"]]
 
 
-def as_objective(part: Objective | ELBO) -> Objective:
+@typed(ValueError)
+def as_objective(objective: Objective | ELBO) -> Objective:
     """An objective, also from a plain ELBO of Pyro's or a user's; anything else is a `ValueError`."""
-    if isinstance(part, ELBO):
-        return Objective(part)
-    if not isinstance(part, Objective):
-        name = type(part).__name__
-        raise ValueError(f"an objective is cavin_pyro.training.objectives.Objective or an ELBO of Pyro, not {name}")
-    return part
+    return Objective(objective) if isinstance(objective, ELBO) else objective
 
 
 def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) -> Tensor:

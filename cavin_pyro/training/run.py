@@ -19,15 +19,7 @@ from cavin_pyro.config.commands import DEFAULT_CHECKPOINT, TrainerConfig, Window
 from cavin_pyro.config.device import choose_device
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED, configured, constructor_options, shown
-from cavin_pyro.config.parts import (
-    PARTS,
-    Config,
-    amortized_guides,
-    build_guide,
-    build_model,
-    build_part,
-    describe,
-)
+from cavin_pyro.config.parts import PARTS, Config, amortized_guides, build_guide, build_model, build_part, describe
 from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
@@ -184,6 +176,7 @@ def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geo
             raise ValueError(f"the windows' features are not of this {type(geometry).__name__}: give what made them")
     if guide.model is not model:
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
+    model.check_priors()
     one = windows.batch(windows.training[:1])
     given = [one.states.centers.shape[-1], one.states.features.shape[-1], one.actions.shape[-1]]
     wanted = [model.space.positions, model.feature_dimension, model.space.actions]

@@ -134,7 +134,9 @@ class PushingEnv(Uncopied, World):
         self.objects, self.maximum_steps, self.render_mode = int(objects), maximum_steps, render_mode
         available = load_object_set(object_set, assets)
         named = ranges or {"names": tuple(dict.fromkeys(map(plain_name, available.names)))}
-        self.ranges = ObjectRanges(**named) if isinstance(named, Mapping) else named
+        if isinstance(named, Mapping):
+            named = ObjectRanges(**known_options(named, *vars(ObjectRanges()), of="ranges"))
+        self.ranges = named
         slots = object_slots(self.objects)
         self.scene = Scene(
             camera=camera, segmentation=segmentation, object_set=available, robot=robot, assets=assets, slots=slots
@@ -247,7 +249,7 @@ class PushingEnv(Uncopied, World):
 
     def state(self, observation: Mapping[str, NDArray[Any]]) -> State:
         """See `World` and `state_of`."""
-        if self.geometry is None:
+        if not callable(self.geometry):
             raise ValueError(
                 "the state of the table needs the geometry of a checkpoint, which makes features of clouds"
             )

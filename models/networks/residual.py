@@ -9,7 +9,6 @@ from operator import add
 import torch
 from torch import Tensor, nn
 
-from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.networks.dynamics import Outcome
 from cavin_pyro.models.networks.layers import neighbours
 from cavin_pyro.models.space import Space
@@ -36,8 +35,6 @@ class ResidualDynamics(Outcome):
         self, space: Space, *, feature_dimension: int = 64, width: int = 64, hidden: int = 256, depth: int = 3
     ) -> None:
         """`hidden`: width of the layers. `depth`: number of residual layers. `width`: of the encoder, not read."""
-        check_number("hidden", hidden, 1, whole=True)
-        check_number("depth", depth, whole=True)
         super().__init__()
         self.space, self.parts = space, (space.positions, feature_dimension)
         inputs = space.inputs + 2 * OCTAVES * space.positions + feature_dimension

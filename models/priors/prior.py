@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from pyro.distributions import TorchDistribution
@@ -14,6 +14,7 @@ from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
 
+@runtime_checkable
 class Prior(Protocol):
     """p(c | s) or p(z | s, c). A structural type: derive a prior from `torch.nn.Module`, not from this.
 

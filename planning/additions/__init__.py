@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from cavin_pyro.models.checks import check_choice
 from cavin_pyro.planning.additions.addition import HOOKS, Addition, Choice, ChosenEffect
 from cavin_pyro.planning.additions.early_stopping import EarlyStopping
 from cavin_pyro.planning.additions.failure_avoidance import FailureAvoidance
@@ -45,19 +46,14 @@ OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `plan
 def make_additions(additions: Sequence[str | Addition], hooks: Sequence[str]) -> tuple[Addition, ...]:
     """Additions by name, with their defaults, or given, in the order in which they act.
 
-    `hooks`: which the planner calls. Raises ValueError: an unknown name, an object that is no addition, one that is
-    given twice, or one without a hook that the planner calls.
+    `hooks`: which the planner calls. Raises ValueError: an unknown name, an addition that is given twice or lacks every
+    hook that the planner calls.
     """
     made = []
     for addition in additions:
         if isinstance(addition, str):
-            if addition not in ADDITIONS:
-                raise ValueError(f"unknown addition '{addition}': choose from {', '.join(ADDITIONS)}")
+            check_choice("addition", addition, ADDITIONS)
             addition = ADDITIONS[addition]()
-        if not isinstance(addition, Addition):
-            raise ValueError(
-                f"{addition!r} is no addition: derive its class from cavin_pyro.planning.additions.Addition"
-            )
         acts = [name for name in HOOKS if getattr(type(addition), name) is not getattr(Addition, name)]
         if (acts and not set(acts) & set(hooks)) or (addition.for_motions and "subgoal_distance" not in hooks):
             raise ValueError(f"{type(addition).__name__} does nothing in this planner: leave it out")

@@ -11,27 +11,14 @@ from cavin_pyro.planning.optimizers.cem import CEM, ICEM
 from cavin_pyro.planning.optimizers.mppi import MPPI
 from cavin_pyro.planning.optimizers.smc import SMC
 
-__all__ = [
-    "CEM",
-    "ICEM",
-    "MPPI",
-    "OPTIMIZERS",
-    "SMC",
-    "Optimizer",
-    "Shooting",
-    "make_optimizer",
-]
+__all__ = ["CEM", "ICEM", "MPPI", "OPTIMIZERS", "SMC", "Optimizer", "Shooting", "make_optimizer"]
 
-OPTIMIZERS: dict[str, type[Optimizer]] = {
-    "shooting": Shooting,
-    "cem": CEM,
-    "icem": ICEM,
-    "mppi": MPPI,
-    "smc": SMC,
-}
+OPTIMIZERS: dict[str, type[Optimizer]] = {"shooting": Shooting, "cem": CEM, "icem": ICEM, "mppi": MPPI, "smc": SMC}
 
 
-def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
+def make_optimizer(
+    optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer", size: str = ""
+) -> Optimizer:
     """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
 
     Raises ValueError, naming the valid ones, for an unknown name or an object that is no optimizer, and for fewer
@@ -46,5 +33,5 @@ def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = 
             f"optimize(problem, samples), not {optimizer!r}"
         )
     if isinstance(optimizer, CEM | MPPI):
-        samples_of_iteration(samples, optimizer.iterations, 0)
+        samples_of_iteration(samples, optimizer.iterations, 0, size)
     return optimizer

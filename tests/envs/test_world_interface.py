@@ -15,11 +15,13 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.config.world import world_of
 from cavin_pyro.envs.world import Goal, World, check_world
+from cavin_pyro.evaluation.rollout import rollout
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
+from cavin_pyro.planning import RandomPlanner
 
 SPACE = Space(origin=(0.0,), length=1.0, step_range=0.5, subgoal_range=1.0, action_sizes=(1,), unit_features=2)
-REAL = torch.ones(1, dtype=torch.bool)
+REAL, SAID = torch.ones(1, dtype=torch.bool), {"success": False}
 TARGET = f"env._target_={__name__}.Line"
 
 
@@ -88,20 +90,19 @@ def states(*places: float) -> Tensor:
         ({"features": 2}, r"must have centers, features and mask \(bool\) of .*, not \[\[1, 1\], \[1, 3\], \[1\]\]"),
         ({"objects": 2}, r"must have centers, features and mask"),
         ({"reset": lambda world, **_: (math.nan, {})}, r"centers must be finite float32 numbers, not .*nan"),
-        ({"step": lambda world, _: (math.inf, 0.0, False, False, {})}, "centers must be finite float32 numbers"),
+        ({"step": lambda world, _: (math.inf, 0.0, False, False, SAID)}, "centers must be finite float32 numbers"),
         ({"step": lambda world, _: (0.0, 0.0, False, False, {})}, "info of a step must have success, and has nothing"),
         ({"step": lambda world, _: (0.0, 0.0, False, False, {"success": math.nan})}, "success as bool, not .* and nan"),
-        ({"maximum_steps": 0}, "maximum_steps must be a number of at least 1, not 0"),
+        ({"maximum_steps": 0}, "maximum_steps must be a whole number of at least 1, not 0"),
         ({"state": lambda world, place: State(torch.zeros(1, 1), torch.eye(3)[:1], ~REAL)}, "its mask has none"),
-        (
-            {"state": lambda world, place: State(torch.zeros(1, 1).double(), torch.zeros(1, 3), REAL)},
-            r"centers must be finite float32 numbers, not torch\.float64",
-        ),
-        (
-            {"state": lambda world, place: State(torch.zeros(1, 1), torch.full((1, 3), 2.0), REAL)},
-            r"the first 2 of a feature must be a vector of length 1 .* not \[\[2\.0, 2\.0, 2\.0\]\]",
-        ),
-        ({"goal": lambda world: Slips(SPACE)}, r"its goal must give success as bool \[5\], not bool \[5, 1\]$"),
+        ({"state": lambda world, place: State(torch.zeros(1, 1).double(), torch.zeros(1, 3), REAL)}, "not torch.float"),
+        ({"state": lambda world, place: State(torch.zeros(1, 1), torch.ones(1, 3), REAL)}, "first 2 of a feature must"),
+        ({"reset": lambda world, **_: 0.0}, "reset must give an observation and info, not 0.0"),
+        ({"step": lambda world, _: 0.0}, "a step must give an observation, .* and info, not 0.0"),
+        ({"step": lambda world, _: (0.0, math.nan, False, False, SAID)}, "must give a finite reward, .*, not nan"),
+        ({"state": lambda world, place: (0.0, 0.0, REAL)}, r"state must be of type State, not \(0.0"),
+        ({"goal": lambda world, *_: None}, r"its goal does not fit states \[5\]: 'NoneType' object is not callable"),
+        ({"goal": lambda world, *_: Slips(SPACE)}, r"its goal must give success as bool \[5\], not bool \[5, 1\]$"),
     ],
 )
 def test_each_slip_of_a_world_is_refused_in_one_line(members: dict[str, Any], said: str) -> None:
@@ -109,6 +110,10 @@ def test_each_slip_of_a_world_is_refused_in_one_line(members: dict[str, Any], sa
     with pytest.raises(ValueError, match=f"^Line: .*{said}") as raised:
         check_world(of(**members)())
     assert "\n" not in str(raised.value)
+    if {"reset", "step", "goal"} & members.keys():  # an episode meets it, too
+        with pytest.raises(UserError, match="Line|of its state") as raised:
+            rollout(of(**members)(), RandomPlanner(action_dimension=1), seed=0)
+        assert "Error" not in str(raised.value) and "\n" not in str(raised.value)
 
 
 def test_a_step_earns_its_end_its_time_and_its_progress() -> None:
@@ -150,7 +155,7 @@ def test_the_tabletop_is_the_world_where_none_is_chosen() -> None:
         (["env=nowhere"], "^unknown env 'nowhere': choose from .*pusht.*, or env._target_=CLASS$"),
         ([TARGET, "task=crossing"], "^task is an option of env=tabletop: leave it out"),
         ([TARGET, "env.width=3"], "Line.* got an unexpected keyword argument 'width'"),
-        (["env._target_=fractions.Fraction"], "^env Fraction is no world: derive it from"),
+        (["env._target_=fractions.Fraction"], "^fractions.Fraction is no World: derive it from"),
         (["env._target_=nowhere.World"], "nowhere"),
         (["env._target_="], "^unknown env ''"),
         (["env=pusht", "env.margin=-1"], "^margin must be a number above 0 and at most 1, not -1"),

@@ -36,7 +36,6 @@ GUIDES: dict[str, tuple[type[Guide], dict[str, Any]]] = {
     "none": (NoGuide, {}),
 }
 PAIRS = [(model, guide) for model in MODELS for guide in GUIDES if model in GUIDES[guide][0].fits]
-MISFITS = [(model, guide) for model in MODELS for guide in GUIDES if model not in GUIDES[guide][0].fits]
 
 
 def make_model(name: str, **more: Any) -> Model:

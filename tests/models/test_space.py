@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.dynamics_only import DynamicsModel
+from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.networks.dynamics import ActionGenerator, StateChange
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
@@ -104,11 +104,14 @@ def test_a_space_that_cannot_be_is_one_clear_line(changed: dict[str, Any], said:
 @pytest.mark.parametrize(
     "changed, said",
     [
-        ({"width": 8.0}, "^width must be a whole number of at least 1, not 8.0$"),
+        ({"effect_dimension": 0}, "^effect_dimension must be a whole number of at least 1, not 0$"),
         ({"neighbours": "4"}, "^neighbours must be a whole number of at least 0, not '4'$"),
+        ({"space": None}, "^space must be of type Space, not None$"),
+        ({"effect_prior": 3}, "^effect_prior must be of type Prior . None, not 3$"),
+        ({"dynamics": StateChange}, "^dynamics must be of type Outcome . None, not the class StateChange$"),
         ({"feature_dimension": 1}, "^a feature has 1 numbers, and the space's unit_features are more$"),
     ],
 )
 def test_a_model_of_sizes_that_cannot_be_is_one_clear_line(changed: dict[str, Any], said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        DynamicsModel(space=TURNING, **changed)
+        CascadedModel(**{"space": TURNING, **changed})

@@ -222,3 +222,5 @@ def test_every_environment_needs_a_generator_of_its_own(seeds: tuple[int, ...] |
     generators = [torch.Generator()] * 2 if seeds is None else [torch.Generator() for _ in seeds]
     with pytest.raises(ValueError, match=f"one generator per environment: {said}"):
         check_scenes(GOOD, generators)
+    with pytest.raises(ValueError, match=r"^generators must be of type Sequence\[Generator\], not an object of Gen"):
+        check_scenes(GOOD, generators[0])  # type: ignore[arg-type]

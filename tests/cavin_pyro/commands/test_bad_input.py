@@ -27,6 +27,10 @@ GOOD = {  # options that are valid and small; @name is a file or folder of `mate
 BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "planner.samples=0", "planner.samples=0: samples must be a whole number of at least 1, not 0"),
     ("plan", "planner.horizon=10", "planner.horizon=10: horizon=10 is not divisible by the model's segment length T=3"),
+    ("plan", "planner.drop=3", "planner.drop=3: drop must be of type Sequence[str], not 3"),
+    ("plan", "planner.optimizer=cem planner.motion_share=0.001", "error: planner.motion_share=0.001: motion_share: 4 "),
+    ("plan", "planner.samples=64 pushes_per_plan=9", "error: pushes_per_plan must be "),
+    ("check", "sizes.elbo=null", "sizes.elbo is a section of options, sizes.elbo.NAME=VALUE, which null cannot"),
     ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
     ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
     ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random, generated or the path of a YAML file"),
@@ -37,7 +41,11 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "checkpoint=@untrusted", "asks to run numpy.save, which is not part of this program"),
     ("train", "scales.center=1e308", "scales.center must be a number of at least 1e-12 and at most 1e+12, not 1e+308"),
     ("train", "dynamics.maximum_displacement=nan", "dynamics.maximum_displacement must be finite, not nan"),
-    ("train", "objective.elbo._target_=builtins.dict", "must be an ELBO of Pyro, such as Trace_ELBO, not dict"),
+    (
+        "train",
+        "objective.elbo._target_=builtins.dict",
+        "error: objective.elbo._target_=builtins.dict: elbo must be of type ELBO, ",
+    ),
     ("check", "sizes.subgoals=3 sections=[subgoals]", "sizes.subgoals=3: Cannot assign int to dict"),
     ("check", "checkpoint=@checkpoint", "its training held out (ValueError: its windows are of no dataset)"),
     ("check", "checkpoint=@far_scale", "far_scale: scales.center must be a number of at least 1e-12 and at most 1e+12"),

@@ -47,6 +47,7 @@ def ended(
 def test_bad_input_is_one_line_and_status_2(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert ended(raising(UserError("choose another output=DIR")), capsys, "assets")[1] == "choose another --to DIR"
     bad = raising(UserError("an option\n  is wrong"))
     assert ended(bad, capsys) == (2, "an option is wrong")
     monkeypatch.setattr(sys, "argv", ["plan", "--traceback"])

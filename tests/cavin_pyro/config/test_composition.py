@@ -124,6 +124,10 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("seed=${oc.decode:'-1'}", "seed must be a whole number of at least 0 and at most 4294967295, not -1"),
     ("margin=inf", "margin in metres must be a number of at least 0 and at most 0.075, not inf"),
     ("train trainer.learning_rate=0", "trainer.learning_rate must be a number above 0 and at most 1e+30, not 0"),
+    ("train windows.validation_fraction=1", "validation_fraction must be a number above 0 and at most 0.99, not 1"),
+    ("train objective.kl_weights={x:1}", "unknown option 'objective.kl_weights.x': "),
+    ("env.robot=[stick]", "unknown env.robot ['stick']: choose from stick, "),
+    ("env=maze env=pusht", "env=maze and env=pusht: choose one env"),
     ("pln seed=0", "unknown command 'pln': choose from quickstart, "),
 ]
 
@@ -194,6 +198,10 @@ def test_presets_of_the_users_own_lie_in_a_folder(tmp_path: Path) -> None:
     config, choices = composed("plan", ["planner=mine"], str(folder.parent))
     assert choices["planner"] == "mine" and config.checkpoint == "cavin"
     assert config.output == "runs/plan/crossing-sparse-3-mine-0"
+    for content, said in (("[1, 2", "is not YAML: "), ("word", "must hold options, .*, not 'word'")):
+        (folder / "mine.yaml").write_text(content)
+        with pytest.raises(UserError, match=f"mine.yaml {said}"):
+            composed("plan", ["planner=mine"], str(folder.parent))
 
 
 def test_help_names_no_option_that_no_command_has() -> None:

@@ -62,10 +62,7 @@ def test_a_guide_that_does_not_fit_its_model_is_refused_by_name(small: SimpleNam
 
 @pytest.mark.parametrize(
     ("part", "said"),
-    [
-        ({"_target_": "cavin_pyro.models.nothing.Nothing"}, "cavin_pyro.models.nothing.Nothing cannot be built"),
-        ({"depth": 3}, "a part has no _target_"),
-    ],
+    [({"_target_": "my_lab.Nothing"}, "my_lab.Nothing cannot be built"), ({"depth": 3}, "a part has no _target_")],
 )
 def test_parts_that_cannot_be_built_are_named(part: dict, said: str) -> None:
     with pytest.raises(UserError, match=said) as caught:
@@ -82,6 +79,8 @@ CONTACT = "cavin_pyro.models.networks.contact.dynamics.ContactDynamics"
     [
         ("prior", {"_target_": FLOW, "width": 0}, "^prior.width must be at least 1, not 0$"),
         ("prior", {"_target_": FLOW, "depth": 3}, f"{FLOW} cannot be built: .*'depth'"),
+        ("prior", {"_target_": "torch.nn.Identity"}, "^effect_prior must give, .*, not an object of State"),
+        ("dynamics", {"_target_": "builtins.int"}, "^builtins.int is no Outcome: derive it from cavin_pyro.models"),
         ("scales", {"_target_": SCALES}, "scales=predicted needs an f that predicts them: dynamics=contact"),
         ("dynamics", {"_target_": CONTACT, "reach_margin": -0.01}, "^reach_margin must be null .*, not -0.01$"),
     ],
@@ -102,12 +101,7 @@ def test_a_model_must_take_the_features_and_the_objects_that_there_are(small: Si
     for one, geometry, objects, said in (
         (model, PointNet(32), 5, "feature_dimension=64, but the PointNet's features have 32"),
         (model, PointNet(), 6, "maximum_objects=5, but datasets have room for 6"),
-        (
-            contact,
-            PointNet(),
-            5,
-            "ContactDynamics reads the features of Outline, not of PointNet: pass geometry=outline",
-        ),
+        (contact, PointNet(), 5, "reads the features of Outline, not of PointNet: pass geometry=outline"),
     ):
         with pytest.raises(UserError, match=said):
             check_fit(one, geometry, objects)

@@ -141,10 +141,7 @@ def test_padding_adds_slots_without_objects(pushes: Path) -> None:
         ({"format": "photographs"}, "does not describe a dataset of this program"),
         ({"version": 2}, "has format version 2, this program reads 1: collect it again"),
         ({"shards": 0}, "is damaged, .*: shards must be a whole number of at least 1, not 0$"),
-        (
-            {"configuration": {"steps": 6, "maximum_objects": 11}},
-            "of at least 1 and at most 10, not 11$",
-        ),
+        ({"configuration": {"steps": 6, "maximum_objects": 11}}, "of at least 1 and at most 10, not 11$"),
         ({"shards": 10**9}, "files have not 12 episodes"),
         ({"shards": 10**9, "episodes": 4 * 10**9}, "counts 1000000000 files of episodes, but 3 are there"),
     ],

@@ -165,11 +165,7 @@ def test_episodes_of_arrays_make_the_windows_that_a_dataset_makes(walks: Path, t
     other = FlatModel(space=Point.space, feature_dimension=2, maximum_objects=1, width=8)
     for programs, more, said in (
         ((model, FlatGuide(other, width=8)), {}, "^the guide was built for another model"),
-        (
-            (other, FlatGuide(other, width=8)),
-            {},
-            "of 2, 1 and 2 numbers and 1 objects, and the model .* 2, 2 and 2 ",
-        ),
+        ((other, FlatGuide(other, width=8)), {}, "of 2, 1 and 2 numbers and 1 objects, and the model .* 2, 2 and 2 "),
         ((model, FlatGuide(model, width=8)), {"seed": -1}, "^seed must be a whole number of at least 0"),
     ):
         with pytest.raises(UserError, match=said):

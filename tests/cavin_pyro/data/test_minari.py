@@ -9,12 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from cavin_pyro.data.dataset import (
-    read_metadata,
-    read_shard,
-    shard_path,
-    write_metadata,
-)
+from cavin_pyro.data.dataset import read_metadata, read_shard, shard_path, write_metadata
 
 
 def test_a_wrong_command_line_is_one_line(data: Callable, tmp_path: Path) -> None:

@@ -60,10 +60,7 @@ def test_a_run_with_another_configuration_is_refused_and_the_option_is_named(
         check_same_run(tmp_path, config(**changes), ignore=())
 
 
-@pytest.mark.parametrize(
-    ("stored", "said"),
-    [("trainer: [a]\n", "a run with .*=.*, not"), ("seed: [1", "is damaged")],
-)
+@pytest.mark.parametrize(("stored", "said"), [("trainer: [a]\n", "a run with .*=.*, not"), ("seed: [1", "is damaged")])
 def test_a_stored_configuration_of_another_form_is_one_line(stored: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text(stored)
     (tmp_path / "metrics.csv").touch()

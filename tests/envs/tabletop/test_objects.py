@@ -169,10 +169,7 @@ def test_a_scan_has_its_own_inertia_and_every_part_of_it_collides(scanned: Scene
     [
         (lambda folder: (folder / "angle_vhacd.obj").unlink(), "angle_vhacd.obj: No such file or directory"),
         (lambda folder: (folder / "meta.json").write_text('{"mug": {"mass": 1}}'), "damaged: KeyError('inertia_diag')"),
-        (
-            lambda folder: (folder / "mug_vhacd.obj").write_text("v nan 0 0\n"),
-            "mug_vhacd.obj are no points in metres",
-        ),
+        (lambda folder: (folder / "mug_vhacd.obj").write_text("v nan 0 0\n"), "mug_vhacd.obj are no points in metres"),
     ],
 )
 def test_a_folder_that_lacks_something_gets_its_one_line(

@@ -175,6 +175,7 @@ def test_an_object_off_the_table_ends_the_episode_with_a_fall(make: Make, put: C
         ({"objects": 11}, r"^objects must be a whole number of at least 1 and at most 10, not 11$"),
         ({"margin": "x"}, r"^margin must be of type float, not 'x'$"),
         ({"tiles": 3}, r"^tiles must be of type Mapping.*, not 3$"),
+        ({"ranges": {"mas": 3}}, "^unknown option 'mas' of ranges: choose from names, scale, mass, "),
         ({"camera": 3}, r"^camera must be of type str . Camera . DepthSensor, not 3$"),
         ({"camera": "webcam"}, r"^unknown camera 'webcam': choose from ideal, kinect2$"),
         ({"object_set": "toys"}, r"^unknown object set 'toys': choose from builtin, ycb, mixed, random$"),

@@ -52,11 +52,7 @@ def test_the_mask_gives_each_object_its_own_measured_pixels_in_order() -> None:
 
 
 @settings(deadline=None, max_examples=20)
-@given(
-    st.tuples(*[st.floats(-0.03, 0.03)] * 3),
-    st.tuples(*[st.floats(-0.04, 0.04)] * 3),
-    st.floats(-0.01, 0.01),
-)
+@given(st.tuples(*[st.floats(-0.03, 0.03)] * 3), st.tuples(*[st.floats(-0.04, 0.04)] * 3), st.floats(-0.01, 0.01))
 def test_the_table_is_found_though_the_cameras_pose_is_not_quite_known(
     rotation: tuple, shift: tuple, error: float
 ) -> None:
