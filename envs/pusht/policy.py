@@ -16,8 +16,6 @@ SPACING = 5.0  # pixels between the points of the outline that the policy knows
 ARRIVED = 6.0  # pixels from where a push begins
 APPROACHES = 6  # steps on the way to a push, at most
 ASTRAY = 0.1  # of the intents are random moves
-STRAIGHT = 0.3  # of the approaches to a block far from walls go straight, through the block if it is in the way
-FAR = 100.0  # pixels
 MARGIN = 35.0  # pixels that pushes leave between block and wall, in which the disc can pass
 CANDIDATES = 12  # pushes to choose one from
 ROUND = 115.0  # pixels from the block's centre of mass, on the way round it
@@ -35,7 +33,6 @@ class PushTPolicy:
     def __init__(self, generator: np.random.Generator) -> None:
         self._generator = generator
         self._approaches = self._pushes = self._moves = 0  # steps left of each kind
-        self._straight = False
         self._contact, self._displacement = np.zeros((2, 2))  # in the block's frame; of the next push, in the window's
         self._turn = 0.0  # radians from one push to the next
 
@@ -50,7 +47,7 @@ class PushTPolicy:
         start = in_window(block, self._contact)
         if self._approaches and np.linalg.norm(start - agent) > ARRIVED:
             self._approaches -= 1
-            way = (start if self._straight else _way(agent, start, block)) - agent
+            way = _way(agent, start, block) - agent
             return way / max(REACH, float(np.abs(way).max()))
         self._approaches = 0
         self._pushes -= 1
@@ -84,8 +81,6 @@ class PushTPolicy:
         self._contact = contacts[best]
         self._displacement = length[best] * headings[best]
         self._approaches, self._pushes, self._turn = APPROACHES, steps, float(generator.normal(scale=0.25))
-        far = bool(((outline > FAR) & (outline < SIZE - FAR)).all())
-        self._straight = far and generator.random() < STRAIGHT
 
 
 def outline_of(state: NDArray[np.float64]) -> NDArray[np.float64]:
