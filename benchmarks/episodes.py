@@ -10,25 +10,21 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import subprocess
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pyarrow
 import torch
-from pyarrow import parquet
+from records import RESULTS, Record, commit, read, write
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
-from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 SCHEMA = pyarrow.schema(
     [
         *((name, pyarrow.string()) for name in ("row", "task")),
@@ -46,7 +42,6 @@ SCHEMA = pyarrow.schema(
     ]
 )
 WRITE_EVERY = 20  # episodes
-Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -209,6 +204,28 @@ def played(jobs: Sequence[tuple[Row, int]], workers: int) -> Generator[list[Reco
             yield future.result()
 
 
+def add(
+    path: Path,
+    rows: Sequence[Row],
+    seeds: Sequence[int],
+    workers: int,
+    about: Mapping[str, Record],
+    schema: pyarrow.Schema = SCHEMA,
+) -> None:
+    """Play what a file does not have yet, and add it; `about`: further columns, by the name of the row."""
+    records = read(path)
+    jobs, now = missing(rows, seeds, records), commit()
+    with (
+        closing(played(jobs, workers)) as ended,
+        progress_bar("playing", total=len(jobs), unit="episode") as bar,
+    ):
+        for number, found in enumerate(ended, start=1):
+            records += [{**record, **about.get(record["row"], {}), "commit": now} for record in found]
+            bar.update()
+            if number % WRITE_EVERY == 0 or number == len(jobs):
+                write(path, records, schema)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("table", choices=TABLES)
@@ -219,21 +236,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="another folder than docs/results")
     arguments = parser.parse_args()
     rows = [row for row in TABLES[arguments.table] if arguments.rows is None or row.name in arguments.rows]
-    path = arguments.results / f"{arguments.table}.parquet"
-    records: list[Record] = parquet.read_table(path).to_pylist() if path.exists() else []
-    jobs = missing(rows, range(arguments.seed, arguments.seed + arguments.episodes), records)
-    revision = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(revision, capture_output=True, text=True, check=True).stdout.strip()
-    with (
-        closing(played(jobs, arguments.workers)) as ended,
-        progress_bar("playing", total=len(jobs), unit="episode") as bar,
-    ):
-        for number, found in enumerate(ended, start=1):
-            records += [{**record, "commit": commit} for record in found]
-            bar.update()
-            if number % WRITE_EVERY == 0 or number == len(jobs):
-                with atomic_write(path) as temporary:
-                    parquet.write_table(pyarrow.Table.from_pylist(records, schema=SCHEMA), temporary)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    add(arguments.results / f"{arguments.table}.parquet", rows, seeds, arguments.workers, {})
 
 
 if __name__ == "__main__":
