@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
 import torch
 from numpy.typing import NDArray
 from pyro import poutine
@@ -198,10 +197,7 @@ def main() -> None:
     for ahead in (1, T):
         together = {who: rows for one in found for who, rows in one[ahead].items()}
         records += [{**record, "seed": arguments.seed, "commit": now} for record in measure(episodes, ahead, together)]
-    types = {"error": pyarrow.float32(), "pushes": pyarrow.int8(), "objects": pyarrow.int8()}
-    schema = pyarrow.Table.from_pylist(records).schema
-    fields = [field.with_type(types.get(field.name, field.type)) for field in schema]
-    write(arguments.output, records, pyarrow.schema(fields))
+    write(arguments.output, records)
 
 
 if __name__ == "__main__":

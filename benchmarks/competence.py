@@ -4,8 +4,7 @@ For each world and size it runs what `python -m cavin_pyro.quickstart minutes=SI
 command in a process of its own, whose minutes count, and then new episodes of each task, which do not. The size
 `shipped` is docs/how-to/collect-and-train.md, the paper's networks on 100,000 pushes. On the tabletop the paper's
 planner meets the same scenes, by the published rules; how its episodes end by the strict ones is also kept. Rerun to
-resume: an interrupted command begins again, and what is in docs/results/competence.parquet is not run again. `--draw`
-runs nothing. Folders of runs are removed by hand, their checkpoints after the last episode.
+resume: an interrupted command begins again, and what is in docs/results/competence.parquet is not run again.
 """
 
 from __future__ import annotations
@@ -22,10 +21,11 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pyarrow
 from episodes import PAPER, SCHEMA, Row, add
 from matplotlib.figure import Figure
-from records import PICTURES, RESULTS, Record, read
+from records import ROOT, Record, read
 from tables import groups
 
 from cavin_pyro.config.composition import compose
@@ -45,10 +45,11 @@ SHIPPED = {
 OF_QUICKSTART = ("task=", "seed=", "episodes=", "workers=", "output=")  # options of its evaluations
 PLANNERS = {"cavin": ("ours", "-"), "search": ("ours", "-"), "paper": ("Algorithm 1, published rules", "--")}
 COLORS = {"clearing": "#0072B2", "insertion": "#D55E00", "crossing": "#009E73", "75 ahead": "#0072B2"}
+TITLES = {"tabletop": "tabletop, 3 objects", "pusht": "Push-T"}
 TICKS = (1, 2, 3, 5, 10, 20, 30, 50, 100)
 COLUMNS = [  # beside those of all episodes
-    *(pyarrow.field(name, pyarrow.string()) for name in ("world", "recipe")),
-    *(pyarrow.field(name, pyarrow.int64()) for name in ("minutes", "training")),
+    *(pyarrow.field(name, pyarrow.string()) for name in ("world", "size")),
+    pyarrow.field("training", pyarrow.int64()),
     *(pyarrow.field(name, pyarrow.float32()) for name in ("collect_minutes", "train_minutes")),
 ]
 
@@ -65,6 +66,7 @@ def commands(world: str, size: str, seed: int, home: Path) -> tuple[dict[str, li
 
 def spent(making: Mapping[str, list[str]], home: Path) -> dict[str, float]:
     """Minutes of each command, which is run once."""
+    home.mkdir(parents=True, exist_ok=True)
     kept = home / "minutes.json"
     minutes: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
     for command in [command for command in making if command not in minutes]:
@@ -98,24 +100,21 @@ def draw(path: Path, records: Sequence[Record]) -> None:
         drawn = [row for row in found if row["rules"] != "strict" or row["planner"] != "paper"]
         for place, ((task, planner), of_line) in enumerate(groups(drawn, "task", "planner").items()):
             label, style = PLANNERS[planner]
-            for (recipe,), of_recipe in groups(of_line, "recipe").items():
-                points = []
-                for rows in groups(of_recipe, "minutes").values():
-                    rate = wilson(sum(row["outcome"] == "success" for row in rows), len(rows))
-                    wall = statistics.mean(row["collect_minutes"] + row["train_minutes"] for row in rows)
-                    points.append((wall * 1.015**place, *(100 * rate[key] for key in ("rate", "low", "high"))))
-                x, y, low, high = zip(*sorted(points), strict=True)
-                whiskers = [[b - a for a, b in zip(low, y, strict=True)], [b - a for a, b in zip(y, high, strict=True)]]
-                shown = {"marker": "o", "linestyle": style, "label": f"{task}, {label}"}
-                shown = shown if recipe == "quickstart" else {"marker": "*", "linestyle": "none"}
-                panel.errorbar(x, y, whiskers, color=COLORS[task], markersize=5, linewidth=1.4, capsize=2, **shown)
+            line = []
+            for (size,), rows in groups(of_line, "size").items():
+                share = wilson(sum(row["outcome"] == "success" for row in rows), len(rows))
+                y, low, high = (100 * share[name] for name in ("rate", "low", "high"))
+                wall = statistics.mean(row["collect_minutes"] + row["train_minutes"] for row in rows)
+                x = wall * 1.015**place  # so that whiskers do not lie on one another
+                marker = "*" if size == "shipped" else "o"
+                panel.errorbar(x, y, [[y - low], [high - y]], color=COLORS[task], marker=marker, capsize=2)
+                line += [] if size == "shipped" else [(x, y)]
+            panel.plot(*np.reshape(sorted(line), (-1, 2)).T, style, color=COLORS[task], label=f"{task}, {label}")
         panel.set_xscale("log")
-        low, high = panel.get_xlim()
+        span = panel.get_xlim()  # which ticks widen
         panel.set_xticks(TICKS, map(str, TICKS))
         panel.set_xticks([], minor=True)
-        panel.set_xlim(low, high)
-        panel.set_ylim(0, 104)
-        panel.set(title=world, xlabel="minutes from an empty folder")
+        panel.set(title=TITLES[world], xlabel="minutes from an empty folder", xlim=span, ylim=(0, 104))
         panel.grid(color="#DDDDDD", linewidth=0.6)
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(frameon=False, fontsize=8, loc="lower right")
@@ -128,34 +127,25 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=10000, help="of the first scene (%(default)s)")
     parser.add_argument("--episodes", type=int, default=100, help="of each task, planner and training (%(default)s)")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
-    parser.add_argument("--sizes", nargs="+", default=SIZES, help="minutes of quickstart, or shipped (%(default)s)")
+    parser.add_argument("--sizes", nargs="*", default=SIZES, help="minutes of quickstart, or shipped; none: draw")
     parser.add_argument("--trainings", type=int, nargs="+", default=[0], help="seeds of data and training")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--runs", type=Path, default=Path("runs/competence"))
-    parser.add_argument("--results", type=Path, default=RESULTS / "competence.parquet")
-    parser.add_argument("--picture", type=Path, default=PICTURES / "competence.png")
-    parser.add_argument("--draw", action="store_true", help="the picture only")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs", help="another folder than docs")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    runs = product(arguments.worlds, arguments.trainings, arguments.sizes)
-    for world, seed, size in [] if arguments.draw else runs:
-        shipped = size == "shipped"
-        if shipped and world != "tabletop":
+    path, schema = arguments.output / "results" / "competence.parquet", pyarrow.schema([*SCHEMA, *COLUMNS])
+    for world, training, size in product(arguments.worlds, arguments.trainings, arguments.sizes):
+        if (world, size) == ("pusht", "shipped"):
             continue
-        name = f"{world}-{size}-{seed}"
-        home = arguments.runs / name
-        home.mkdir(parents=True, exist_ok=True)
-        making, evaluations = commands(world, size, seed, home)
-        minutes = spent(making, home)
-        about: Record = {
-            **{"world": world, "recipe": "shipped" if shipped else "quickstart", "training": seed},
-            **{"minutes": None if shipped else int(size), "collect_minutes": minutes["collect"]},
-            "train_minutes": sum(minutes.values()) - minutes["collect"],
-        }
-        rows = rows_of(name, evaluations)
-        schema = pyarrow.schema([*SCHEMA, *COLUMNS])
-        add(arguments.results, rows, seeds, arguments.workers, {row.name: about for row in rows}, schema)
-    draw(arguments.picture, read(arguments.results))
+        name = f"{world}-{size}-{training}"
+        making, evaluations = commands(world, size, training, arguments.runs / name)
+        minutes = spent(making, arguments.runs / name)
+        rows, collecting = rows_of(name, evaluations), minutes.pop("collect")
+        about: Record = {"world": world, "size": size, "training": training}
+        about |= {"collect_minutes": collecting, "train_minutes": sum(minutes.values())}
+        add(path, rows, seeds, arguments.workers, {row.name: about for row in rows}, schema)
+    draw(arguments.output / "pictures" / "competence.png", read(path))
 
 
 if __name__ == "__main__":

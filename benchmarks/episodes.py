@@ -9,9 +9,7 @@ record, of how it ends by the strict ones. `python benchmarks/tables.py` then wr
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +21,7 @@ from records import RESULTS, Record, commit, read, write
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
+from cavin_pyro.launching.workers import run_jobs
 from cavin_pyro.storage.progress import progress_bar
 
 SCHEMA = pyarrow.schema(
@@ -154,9 +153,10 @@ TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "world
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 
-def play(row: Row, seed: int) -> list[Record]:
+def play(job: tuple[Row, int]) -> list[Record]:
     """One episode of a row: a record, or with the published rules two."""
     global _runner
+    row, seed = job
     torch.set_num_threads(1)
     overrides = row.overrides(seed)
     config = compose("evaluate", *overrides)
@@ -164,10 +164,10 @@ def play(row: Row, seed: int) -> list[Record]:
         if _runner is not None:
             _runner[1].env.close()
         _runner = overrides, make_runner(config)
-    found = episode_row(_runner[1].rollout(seed))
+    found, given = episode_row(_runner[1].rollout(seed)), dict(option.split("=", 1) for option in row.options)
     shared = {
         **{"row": row.name, "task": row.task, "objects": row.objects, "seed": seed},
-        "planner": _option(row, "planner", "cavin" if row.objects else "search"),
+        "planner": given.get("planner", "cavin" if row.objects else "search"),
         "checkpoint": config.checkpoint or config.planner.default_checkpoint,
         **{name: found[name] for name in ("unsafe", "ineffective", "planning_ms")},
     }
@@ -175,7 +175,7 @@ def play(row: Row, seed: int) -> list[Record]:
         return [{**shared, **{name: found[name] for name in ("outcome", "steps")}}]
     shared |= {
         **{"layout": str(config.layout), "tiles": config.generated.tiles if config.layout == "generated" else None},
-        "segmentation": _option(row, "env.segmentation", "mask"),
+        "segmentation": given.get("env.segmentation", "mask"),
     }
     records = [{**shared, "rules": config.criterion, "outcome": found["outcome"], "steps": found["steps"]}]
     if config.criterion != "strict":
@@ -183,25 +183,11 @@ def play(row: Row, seed: int) -> list[Record]:
     return records
 
 
-def _option(row: Row, name: str, default: str) -> str:
-    return dict(option.split("=", 1) for option in row.options).get(name, default)
-
-
 def missing(rows: Sequence[Row], seeds: Sequence[int], known: Sequence[Record]) -> list[tuple[Row, int]]:
     """Episodes of these rows and seeds that no record has."""
     done = {(record["row"], record["task"], record["seed"]) for record in known}
     by_training = sorted(seeds, key=lambda seed: seed % TRAININGS)  # so that few models are loaded
     return [(row, seed) for row in rows for seed in by_training if (row.name, row.task, seed) not in done]
-
-
-def played(jobs: Sequence[tuple[Row, int]], workers: int) -> Generator[list[Record], None, None]:
-    """The records of each episode, as they end; one worker plays here, several in processes of their own."""
-    if workers == 1:
-        yield from (play(*job) for job in jobs)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(play, *job) for job in jobs]):
-            yield future.result()
 
 
 def add(
@@ -215,11 +201,8 @@ def add(
     """Play what a file does not have yet, and add it; `about`: further columns, by the name of the row."""
     records = read(path)
     jobs, now = missing(rows, seeds, records), commit()
-    with (
-        closing(played(jobs, workers)) as ended,
-        progress_bar("playing", total=len(jobs), unit="episode") as bar,
-    ):
-        for number, found in enumerate(ended, start=1):
+    with closing(run_jobs(play, jobs, workers)) as ended, progress_bar("playing", total=len(jobs)) as bar:
+        for number, (_, found) in enumerate(ended, start=1):
             records += [{**record, **about.get(record["row"], {}), "commit": now} for record in found]
             bar.update()
             if number % WRITE_EVERY == 0 or number == len(jobs):

@@ -14,7 +14,6 @@ from cavin_pyro.storage.files import atomic_write
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
-PICTURES = ROOT / "docs" / "pictures"
 Record = dict[str, Any]
 
 

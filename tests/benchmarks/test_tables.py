@@ -92,9 +92,3 @@ def test_errors_of_predictions_stand_beside_their_floor(tmp_path: Path) -> None:
     rows = parquet.read_table(tmp_path / "a.parquet").to_pylist()
     assert {row["predictor"] for row in rows} >= {"hidden", "camera", "contact, f"}
     assert all(row["error"] >= 0.0 and row["pushes"] in (1, 3) for row in rows)
-
-
-def test_training_by_hand_has_the_same_loss() -> None:
-    """It asserts that both losses are equal."""
-    ended = run_script(ROOT / "benchmarks" / "training.py", "8", folder=ROOT)
-    assert ended.status == 0 and "ratio" in ended.output, ended.errors
