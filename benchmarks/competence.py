@@ -60,7 +60,7 @@ def commands(world: str, size: str, seed: int, home: Path) -> tuple[dict[str, li
     steps = list(steps_of(compose("quickstart", *WORLDS[world], *minutes, f"seed={seed}"), home))
     making = {step.command: step.options for step in steps if step.command in ("collect", "train")}
     if not minutes:
-        making = {command: options.format(home=home, seed=seed).split() for command, options in SHIPPED.items()}
+        making = {name: [one.format(home=home, seed=seed) for one in text.split()] for name, text in SHIPPED.items()}
     return making, [step.options for step in steps if step.command == "evaluate"]
 
 
@@ -119,6 +119,7 @@ def draw(path: Path, records: Sequence[Record]) -> None:
         panel.spines[["top", "right"]].set_visible(False)
         panel.legend(frameon=False, fontsize=8, loc="lower right")
     panels[0].set_ylabel("success, %")
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_figure(path, figure)
 
 

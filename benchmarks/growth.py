@@ -120,6 +120,7 @@ def draw(path: Path, records: Sequence[Record]) -> None:
         panel.set_ylabel(label)
     axes[-1][0].set_ylim(bottom=0)
     figure.legend(*axes[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=len(COLORS), frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_figure(path, figure)
 
 

@@ -28,5 +28,6 @@ def read(path: Path) -> list[Record]:
 
 
 def write(path: Path, rows: Sequence[Record], schema: pyarrow.Schema | None = None) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
         parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), temporary)
