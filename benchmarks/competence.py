@@ -34,7 +34,6 @@ from cavin_pyro.evaluation.statistics import wilson
 from cavin_pyro.visualization.training import DOTS_PER_INCH, save_figure
 
 WORLDS = {"tabletop": [], "pusht": ["env=pusht"]}
-SIZES = ("3", "5", "10", "20")  # minutes, or shipped
 SHIPPED = {
     "collect": "transitions=100000 workers=2 seed={seed} output={home}/data",
     "pretrain": "data={home}/data seed={seed} output={home}/pretrain",
@@ -128,7 +127,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=10000, help="of the first scene (%(default)s)")
     parser.add_argument("--episodes", type=int, default=100, help="of each task, planner and training (%(default)s)")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=WORLDS)
-    parser.add_argument("--sizes", nargs="*", default=SIZES, help="minutes of quickstart, or shipped; none: draw")
+    parser.add_argument("--sizes", nargs="*", default=("3", "5", "10", "20"), help="minutes, or shipped; none: draw")
     parser.add_argument("--trainings", type=int, nargs="+", default=[0], help="seeds of data and training")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--runs", type=Path, default=Path("runs/competence"))

@@ -199,9 +199,10 @@ def add(
     schema: pyarrow.Schema = SCHEMA,
 ) -> None:
     """Play what a file does not have yet, and add it; `about`: further columns, by the name of the row."""
-    records = read(path)
-    jobs, now = missing(rows, seeds, records), commit()
-    with closing(run_jobs(play, jobs, workers)) as ended, progress_bar("playing", total=len(jobs)) as bar:
+    records, now = read(path), commit()
+    jobs = missing(rows, seeds, records)
+    bar = progress_bar("playing", total=len(jobs), unit="episode")
+    with bar, closing(run_jobs(play, jobs, workers)) as ended:
         for number, (_, found) in enumerate(ended, start=1):
             records += [{**record, **about.get(record["row"], {}), "commit": now} for record in found]
             bar.update()
