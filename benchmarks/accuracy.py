@@ -14,7 +14,6 @@ distance between the motion of the mean of the visible points and that of the bo
 from __future__ import annotations
 
 import argparse
-import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -22,11 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
 import torch
 from numpy.typing import NDArray
-from pyarrow import parquet
 from pyro import poutine
+from records import RESULTS, commit, write
 
 from cavin_pyro.data.collection import CollectionConfig, clutter_area, heuristic_policy, open_scene
 from cavin_pyro.data.features import cloud_features
@@ -35,10 +33,8 @@ from cavin_pyro.envs.tabletop.observation import Observation
 from cavin_pyro.envs.tabletop.scene import FALLEN, Scene
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.checkpoint import load
-from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 T = 3  # pushes of a segment
 MOVED, STILL, PHANTOM = 0.01, 0.002, 0.02  # metres
 Replays = dict[int, NDArray[np.float64]]  # [redraws, objects, 3] motions in metres after 1 and T pushes; NaN if fallen
@@ -197,20 +193,11 @@ def main() -> None:
             episodes.append(play(scene, twin, config, number, arguments.redraws))
             bar.update()
     found = [predictions(path, episodes) for path in arguments.checkpoints]
-    revision = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(revision, capture_output=True, text=True, check=True).stdout.strip()
-    records = []
+    records, now = [], commit()
     for ahead in (1, T):
         together = {who: rows for one in found for who, rows in one[ahead].items()}
-        records += [
-            {**record, "seed": arguments.seed, "commit": commit} for record in measure(episodes, ahead, together)
-        ]
-    types = [("error", pyarrow.float32()), ("pushes", pyarrow.int8()), ("objects", pyarrow.int8())]
-    table = pyarrow.Table.from_pylist(records)
-    for name, kind in types:
-        table = table.set_column(table.schema.get_field_index(name), name, table[name].cast(kind))
-    with atomic_write(arguments.output) as temporary:
-        parquet.write_table(table, temporary)
+        records += [{**record, "seed": arguments.seed, "commit": now} for record in measure(episodes, ahead, together)]
+    write(arguments.output, records)
 
 
 if __name__ == "__main__":

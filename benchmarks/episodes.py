@@ -9,26 +9,21 @@ record, of how it ends by the strict ones. `python benchmarks/tables.py` then wr
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import subprocess
-from collections.abc import Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pyarrow
 import torch
-from pyarrow import parquet
+from records import RESULTS, Record, commit, read, write
 
 from cavin_pyro.config.composition import compose
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
-from cavin_pyro.storage.files import atomic_write
+from cavin_pyro.launching.workers import run_jobs
 from cavin_pyro.storage.progress import progress_bar
 
-RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 SCHEMA = pyarrow.schema(
     [
         *((name, pyarrow.string()) for name in ("row", "task")),
@@ -46,7 +41,6 @@ SCHEMA = pyarrow.schema(
     ]
 )
 WRITE_EVERY = 20  # episodes
-Record = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -159,9 +153,10 @@ TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "world
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 
-def play(row: Row, seed: int) -> list[Record]:
+def play(job: tuple[Row, int]) -> list[Record]:
     """One episode of a row: a record, or with the published rules two."""
     global _runner
+    row, seed = job
     torch.set_num_threads(1)
     overrides = row.overrides(seed)
     config = compose("evaluate", *overrides)
@@ -169,10 +164,10 @@ def play(row: Row, seed: int) -> list[Record]:
         if _runner is not None:
             _runner[1].env.close()
         _runner = overrides, make_runner(config)
-    found = episode_row(_runner[1].rollout(seed))
+    found, given = episode_row(_runner[1].rollout(seed)), dict(option.split("=", 1) for option in row.options)
     shared = {
         **{"row": row.name, "task": row.task, "objects": row.objects, "seed": seed},
-        "planner": _option(row, "planner", "cavin" if row.objects else "search"),
+        "planner": given.get("planner", "cavin" if row.objects else "search"),
         "checkpoint": config.checkpoint or config.planner.default_checkpoint,
         **{name: found[name] for name in ("unsafe", "ineffective", "planning_ms")},
     }
@@ -180,16 +175,12 @@ def play(row: Row, seed: int) -> list[Record]:
         return [{**shared, **{name: found[name] for name in ("outcome", "steps")}}]
     shared |= {
         **{"layout": str(config.layout), "tiles": config.generated.tiles if config.layout == "generated" else None},
-        "segmentation": _option(row, "env.segmentation", "mask"),
+        "segmentation": given.get("env.segmentation", "mask"),
     }
     records = [{**shared, "rules": config.criterion, "outcome": found["outcome"], "steps": found["steps"]}]
     if config.criterion != "strict":
         records.append({**shared, "rules": "strict", **{key: found[f"strict_{key}"] for key in ("outcome", "steps")}})
     return records
-
-
-def _option(row: Row, name: str, default: str) -> str:
-    return dict(option.split("=", 1) for option in row.options).get(name, default)
 
 
 def missing(rows: Sequence[Row], seeds: Sequence[int], known: Sequence[Record]) -> list[tuple[Row, int]]:
@@ -199,14 +190,24 @@ def missing(rows: Sequence[Row], seeds: Sequence[int], known: Sequence[Record]) 
     return [(row, seed) for row in rows for seed in by_training if (row.name, row.task, seed) not in done]
 
 
-def played(jobs: Sequence[tuple[Row, int]], workers: int) -> Generator[list[Record], None, None]:
-    """The records of each episode, as they end; one worker plays here, several in processes of their own."""
-    if workers == 1:
-        yield from (play(*job) for job in jobs)
-        return
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(play, *job) for job in jobs]):
-            yield future.result()
+def add(
+    path: Path,
+    rows: Sequence[Row],
+    seeds: Sequence[int],
+    workers: int,
+    about: Mapping[str, Record],
+    schema: pyarrow.Schema = SCHEMA,
+) -> None:
+    """Play what a file does not have yet, and add it; `about`: further columns, by the name of the row."""
+    records, now = read(path), commit()
+    jobs = missing(rows, seeds, records)
+    bar = progress_bar("playing", total=len(jobs), unit="episode")
+    with bar, closing(run_jobs(play, jobs, workers)) as ended:
+        for number, (_, found) in enumerate(ended, start=1):
+            records += [{**record, **about.get(record["row"], {}), "commit": now} for record in found]
+            bar.update()
+            if number % WRITE_EVERY == 0 or number == len(jobs):
+                write(path, records, schema)
 
 
 def main() -> None:
@@ -219,21 +220,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS, help="another folder than docs/results")
     arguments = parser.parse_args()
     rows = [row for row in TABLES[arguments.table] if arguments.rows is None or row.name in arguments.rows]
-    path = arguments.results / f"{arguments.table}.parquet"
-    records: list[Record] = parquet.read_table(path).to_pylist() if path.exists() else []
-    jobs = missing(rows, range(arguments.seed, arguments.seed + arguments.episodes), records)
-    revision = ["git", "-C", str(RESULTS), "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(revision, capture_output=True, text=True, check=True).stdout.strip()
-    with (
-        closing(played(jobs, arguments.workers)) as ended,
-        progress_bar("playing", total=len(jobs), unit="episode") as bar,
-    ):
-        for number, found in enumerate(ended, start=1):
-            records += [{**record, "commit": commit} for record in found]
-            bar.update()
-            if number % WRITE_EVERY == 0 or number == len(jobs):
-                with atomic_write(path) as temporary:
-                    parquet.write_table(pyarrow.Table.from_pylist(records, schema=SCHEMA), temporary)
+    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
+    add(arguments.results / f"{arguments.table}.parquet", rows, seeds, arguments.workers, {})
 
 
 if __name__ == "__main__":

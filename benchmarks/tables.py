@@ -2,26 +2,24 @@
 
 A table stands between `<!-- table: NAME -->` and `<!-- end -->`. Each follows from one file of docs/results with a row
 per episode (or per measured time, or predicted object), which also names the commit that ran it. Rates have Wilson's
-intervals at 95 %; two planners in the same scenes are compared by the exact McNemar test. `--check` writes nothing and
-fails if a page would change.
+intervals at 95 %; two planners in the same scenes are compared by the exact McNemar test.
 """
 
 from __future__ import annotations
 
-import argparse
 import re
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
+from itertools import product
 from typing import Any
 
-from pyarrow import parquet
+import records
+from records import RESULTS, ROOT
+from records import Record as Row
 
 from cavin_pyro.evaluation.statistics import mcnemar, wilson
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "docs" / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 MARKERS = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 TASKS = ("clearing", "insertion", "crossing")
@@ -29,13 +27,11 @@ RULES = ("published", "strict")
 METHODS = {"cavin": "CAVIN", "contact": "CAVIN, contact", "sectar": "SeCTAR", "cvae_mpc": "CVAE-MPC", "mpc": "MPC"}
 WORLDS = "75 ahead", "maze"  # of Push-T, and the other one
 NOTHING = "Not measured yet.\n"
-Row = dict[str, Any]
 
 
 def read(name: str) -> list[Row]:
     """The rows of docs/results/NAME.parquet."""
-    rows: list[Row] = parquet.read_table(RESULTS / f"{name}.parquet").to_pylist()
-    return rows
+    return records.read(RESULTS / f"{name}.parquet")
 
 
 def groups(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Row]]:
@@ -155,20 +151,13 @@ def additions() -> str:
 def reproduction() -> str:
     """The bars of the paper's figure by both rules, planners as in the paper, 3 objects."""
     rows = [row for row in read("reproduction") if row["planner"] == "paper" and row["objects"] == 3]
-    lines = []
-    for rules in RULES:
-        for method in METHODS:
-            cells = groups([row for row in rows if row["method"] == method], "task", "reward")
-            rates = [
-                rate(cells.get((task, reward), []), f"{rules}_outcome")
-                for task in TASKS
-                for reward in ("dense", "sparse")
-            ]
-            if any(rates):
-                lines.append([METHODS[method], rules, *rates])
-    return markdown(
-        ["method", "rules", *(f"{task}, {reward}" for task in TASKS for reward in ("dense", "sparse"))], lines
-    )
+    cells, lines = list(product(TASKS, ("dense", "sparse"))), []
+    for rules, method in product(RULES, METHODS):
+        found = groups([row for row in rows if row["method"] == method], "task", "reward")
+        rates = [rate(found.get(cell, []), f"{rules}_outcome") for cell in cells]
+        if any(rates):
+            lines.append([METHODS[method], rules, *rates])
+    return markdown(["method", "rules", *map(", ".join, cells)], lines)
 
 
 def more_objects() -> str:
@@ -191,24 +180,17 @@ def variants() -> str:
             tasks = groups(found, "task")
             rates = [rate(tasks.get((task,), []), f"{rules}_outcome") for rules in RULES for task in TASKS]
             lines.append([METHODS[method], f"`{planner}`", len(found), *rates])
-    return markdown(
-        ["method", "planner", "episodes", *(f"{task}, {rules}" for rules in RULES for task in TASKS)], lines
-    )
+    head = [f"{task}, {rules}" for rules, task in product(RULES, TASKS)]
+    return markdown(["method", "planner", "episodes", *head], lines)
 
 
 def factors() -> str:
     """Networks, data and planner in crossing: success by the strict rules, and pushes."""
     lines = []
     for (planner, method, data), found in sorted(groups(read("factors"), "planner", "method", "data").items()):
-        by_count = groups(found, "objects")
-        cells = [
-            text
-            for count in (3, 5)
-            for text in (
-                rate(by_count[count,], "strict_outcome"),
-                pushes(by_count[count,], "strict_outcome", "strict_steps"),
-            )
-        ]
+        cells = []
+        for (_,), rows in sorted(groups(found, "objects").items()):
+            cells += [rate(rows, "strict_outcome"), pushes(rows, "strict_outcome", "strict_steps")]
         lines.append([f"`{planner}`", f"`{method}`", data, len(found), *cells])
     head = ["planner", "networks", "pushes in training", "episodes"]
     return markdown([*head, *(f"{what}, {count} objects" for count in (3, 5) for what in ("success", "pushes"))], lines)
@@ -217,16 +199,16 @@ def factors() -> str:
 def accuracy() -> str:
     """Errors of predicted centres, in centimetres, of objects that moved and that did not."""
     rows = read("accuracy")
-    kinds: list[tuple[str, Callable[[Row], bool]]] = [
-        ("all", lambda row: True),
-        ("five objects", lambda row: row["objects"] == 5),
-    ]
+    kinds = {"all": range(1, 6), "five objects": [5]}
     who = list(dict.fromkeys(row["predictor"] for row in rows))
     lines = []
     for ahead in sorted({row["pushes"] for row in rows}):
-        for name, chosen in kinds:
+        for name, objects in kinds.items():
             cells = {one: [row for row in rows if row["pushes"] == ahead and row["predictor"] == one] for one in who}
-            moved = {one: [100 * row["error"] for row in cells[one] if row["moved"] and chosen(row)] for one in who}
+            moved = {
+                one: [100 * row["error"] for row in cells[one] if row["moved"] and row["objects"] in objects]
+                for one in who
+            }
             texts = [_errors(moved[one]) for one in who]
             lines.append([f"{ahead} push{'es' * (ahead > 1)}, {name}", len(moved[who[0]]), *texts])
         still = {one: [row["phantom"] for row in cells[one] if not row["moved"]] for one in who}
@@ -277,7 +259,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "worlds": worlds,
     "speed": lambda: as_stored("speed"),
-    "criticism": lambda: as_stored("criticism"),
 }
 
 
@@ -293,15 +274,8 @@ def written(text: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--check", action="store_true", help="write nothing; fail if a page would change")
-    arguments = parser.parse_args()
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        now = written(text)
-        if now != text and arguments.check:
-            raise SystemExit(f"{page.relative_to(ROOT)} differs from docs/results: run python benchmarks/tables.py")
-        page.write_text(now, encoding="utf-8")
+        page.write_text(written(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -320,7 +320,7 @@ class QuickstartConfig(LaunchOptions):
     """Options of `python -m cavin_pyro.quickstart`."""
 
     defaults: list[Any] = preset_defaults("world=tabletop")
-    minutes: int = option(20, "how long it takes on two idle cores, on the tabletop", choices=("10", "20"))
+    minutes: int = option(20, "how long it takes on two idle cores, on the tabletop", minimum=3, maximum=120)
     episodes: int = option(20, "episodes of each task, to see what comes out", minimum=1)
     output: str | None = option(None, FOLDER)
     world: Any = None

@@ -1,10 +1,11 @@
 """What `quickstart` runs: the commands from an empty folder to a planner, by world and number of minutes.
 
-Minutes are those of the tabletop on two idle cores. docs/results.md has what comes out.
+Minutes are those of the tabletop on two idle cores; sizes are powers of them. docs/results.md has what comes out.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,12 +17,12 @@ from cavin_pyro.config.options import constructor_options, flat_options
 
 
 class Recipe(NamedTuple):
-    """Options as typed. sizes: by minutes, transitions to collect and steps of training. tasks: one evaluation each."""
+    """Options as typed. sizes: of data and of training, in 10 and 20 minutes. tasks: one evaluation each."""
 
     collect: str
     train: str
     plan: str
-    sizes: dict[int, tuple[int, int]]
+    sizes: tuple[tuple[int, int], tuple[int, int]]
     tasks: tuple[str, ...] = ("",)
 
 
@@ -41,7 +42,7 @@ TABLETOP = Recipe(
     "objective=rollout trainer.reflect=true trainer.batches=bucketed trainer.matmul_precision=bfloat16 "
     f"trainer.learning_rate=2e-3 trainer.clip_norm=10000 windows.negative_fraction=0.5 {TRAINER}",
     plan="",
-    sizes={10: (10_000, 3_300), 20: (20_000, 7_000)},
+    sizes=((10_000, 20_000), (3_300, 7_000)),
     tasks=("task=clearing", "task=insertion", "task=crossing"),
 )
 WORLDS = {
@@ -51,23 +52,23 @@ WORLDS = {
         f"model.effect_dimension=8 model.motion_dimension=8 {FLOW}",
         plan="planner.horizon=15 planner.shrinking_horizon=true planner.reward_at=subgoals planner.samples=2048 "
         "planner.optimizer=icem planner.optimizer.iterations=10 planner.optimizer.elite_fraction=0.03",
-        sizes={10: (100_000, 4_000), 20: (300_000, 9_000)},
+        sizes=((100_000, 300_000), (4_000, 9_000)),
     ),
     "maze": Recipe(
         collect="steps=100",
         train=f"model.width=64 guide.width=64 model.effect_dimension=4 model.motion_dimension=4 {FLOW}",
         plan="planner.horizon=60 planner.motion_horizon=first_segment planner.samples=4096",
-        sizes={10: (50_000, 3_000), 20: (100_000, 8_000)},
+        sizes=((50_000, 100_000), (3_000, 8_000)),
     ),
 }
-OWN = Recipe("", FLOW, "", {10: (20_000, 3_000), 20: (100_000, 8_000)})
+OWN = Recipe("", FLOW, "", ((20_000, 100_000), (3_000, 8_000)))
 
 
 def steps_of(config: DictConfig, home: Path) -> Iterator[Step]:
     """The commands of `quickstart` in their order; each writes into a folder of `home`."""
     recipe, env = _of_world(config)
     minutes, seed, workers = int(config.minutes), f"seed={config.seed}", f"workers={config.workers}"
-    transitions, steps = recipe.sizes[minutes]
+    transitions, steps = (round(ten * (twenty / ten) ** math.log2(minutes / 10)) for ten, twenty in recipe.sizes)
     checkpoint = f"checkpoint={home / 'train' / 'checkpoint.safetensors'}"
 
     def step(command: str, place: str, share: float, *options: str) -> Step:

@@ -15,11 +15,10 @@ from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result,
 
 def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
     """Write `config.yaml` and return the configuration as plain data."""
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
     with atomic_write(folder / CONFIG_NAME) as temporary:
         temporary.write_text(OmegaConf.to_yaml(config, resolve=True), encoding="utf-8")
-    return {str(name): value for name, value in plain.items()}
+    return plain
 
 
 def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...]) -> None:

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-import pyarrow
 import pytest
 from pyarrow import parquet
 
+from cavin_pyro.config.composition import compose
 from tests.cavin_pyro.conftest import run_script
 
 ROOT = Path(__file__).parents[2]
@@ -34,16 +34,11 @@ def test_the_cards_of_shipped_models_are_those_that_the_command_writes(tmp_path:
     assert ended.status == 0, ended.errors
 
 
-def test_another_outcome_changes_the_table(
-    load: Callable[[str], ModuleType], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_outcome_changes_the_table(load: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch) -> None:
     tables = load("tables")
-    before, stored = tables.success(), parquet.read_table(tables.RESULTS / "success.parquet")
-    rows = stored.to_pylist()
-    lost = next(row for row in rows if row["outcome"] == "success")
-    lost["outcome"] = "fall"
-    parquet.write_table(pyarrow.Table.from_pylist(rows, schema=stored.schema), tmp_path / "success.parquet")
-    monkeypatch.setattr(tables, "RESULTS", tmp_path)
+    before, rows = tables.success(), tables.read("success")
+    next(row for row in rows if row["outcome"] == "success")["outcome"] = "fall"
+    monkeypatch.setattr(tables, "read", lambda name: rows)
     assert tables.success() != before
 
 
@@ -51,8 +46,7 @@ def test_pairs_and_blocks_of_seeds_are_counted(load: Callable[[str], ModuleType]
     tables = load("tables")
     one = [{"seed": seed, "outcome": "success" if seed < 13 else "fall"} for seed in range(10, 20)]
     other = [{"seed": seed, "outcome": "success" if seed > 11 else "fall"} for seed in (10, 11, 12, 13, 30)]
-    alone, others, p = tables.paired(one, other)
-    assert (alone, others, p) == (2, 1, 1.0)
+    assert tables.paired(one, other) == (2, 1, 1.0)
     assert tables.seeds(other) == "10 to 13, 30 to 30"
     assert tables.rate(one) == "30.0 % (10.8 to 60.3)"
 
@@ -78,9 +72,8 @@ def test_episodes_are_added_once(
         monkeypatch.setattr(sys, "argv", ["episodes.py", "success", *options])
         episodes.main()
     rows = parquet.read_table(tmp_path / "success.parquet").to_pylist()
-    assert [(row["rules"], row["seed"]) for row in rows] == [
-        (rules, seed) for seed in (3, 4) for rules in ("published", "strict")
-    ]
+    expected = [(rules, seed) for seed in (3, 4) for rules in ("published", "strict")]
+    assert [(row["rules"], row["seed"]) for row in rows] == expected
     assert {row["planner"] for row in rows} == {"random"} and all(row["commit"] for row in rows)
 
 
@@ -94,7 +87,17 @@ def test_errors_of_predictions_stand_beside_their_floor(tmp_path: Path) -> None:
     assert all(row["error"] >= 0.0 and row["pushes"] in (1, 3) for row in rows)
 
 
-def test_training_by_hand_has_the_same_loss() -> None:
-    """It asserts that both losses are equal."""
-    ended = run_script(ROOT / "benchmarks" / "training.py", "8", folder=ROOT)
-    assert ended.status == 0 and "ratio" in ended.output, ended.errors
+@pytest.mark.parametrize("size", ["3", "shipped"])
+def test_commands_know_the_options_that_competence_gives_them(size: str, load: Callable[[str], ModuleType]) -> None:
+    making, evaluations = load("competence").commands("tabletop", size, 1, Path("a folder"))
+    evaluated = [row.overrides(0) for row in load("competence").rows_of("a name", evaluations)]
+    assert len(evaluated) == 6 and all(compose("evaluate", *options) for options in evaluated)
+    assert all(compose(command, *options).output.startswith("a folder/") for command, options in making.items())
+
+
+@pytest.mark.soak
+def test_a_point_of_each_panel_is_measured(tmp_path: Path) -> None:
+    ended = run_script(ROOT / "benchmarks" / "growth.py", "--quick", "--output", str(tmp_path), folder=tmp_path)
+    assert ended.status == 0 and (tmp_path / "pictures" / "growth.png").exists(), ended.errors
+    rows = parquet.read_table(tmp_path / "results" / "growth.parquet").to_pylist()
+    assert len(rows) == 6 and all(row["median_ms"] > 0 and row["peak_mb"] > 100 for row in rows)

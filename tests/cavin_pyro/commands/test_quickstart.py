@@ -35,10 +35,8 @@ def test_every_step_of_a_recipe_has_options_that_its_command_knows(world: str) -
 def test_one_command_makes_a_planner_and_goes_on_where_it_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    small = recipes.Recipe(
-        "steps=8 env.criterion=none episodes_per_shard=5", TINY, "planner.samples=8 planner.horizon=3", {10: (100, 2)}
-    )
-    monkeypatch.setitem(recipes.WORLDS, "pusht", small)
+    collect, plan = "steps=8 env.criterion=none episodes_per_shard=5", "planner.samples=8 planner.horizon=3"
+    monkeypatch.setitem(recipes.WORLDS, "pusht", recipes.Recipe(collect, TINY, plan, ((100, 200), (2, 4))))
     words = ["env=pusht", "env.ahead=25", "env.maximum_steps=2", "minutes=10", "episodes=2", f"output={tmp_path}"]
     for _ in range(2):
         monkeypatch.setattr(sys, "argv", ["quickstart.py", *words, "workers=1"])
