@@ -22,7 +22,6 @@ from cavin_pyro.config.composition import compose
 from cavin_pyro.config.parts import build_guide, build_model
 from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.state import State, Window
-from cavin_pyro.training.bounds import DifferentiableRenyiELBO
 from cavin_pyro.training.cuda_graphs import capturable, capturable_loss
 from cavin_pyro.training.elbo import elbo_terms, term_counts
 from cavin_pyro.training.objectives import Loss, Objective, as_objective, counterfactual_loss, rollout_loss
@@ -130,11 +129,6 @@ def test_other_estimators_of_the_bound_give_its_value_and_gradients(
     assert_same(loss, expected, programs)
 
 
-def test_pyros_own_renyi_bound_has_our_value_and_gradients(programs: Programs, window: Window) -> None:
-    loss = loss_at(Objective(RenyiELBO(alpha=0.5, **PARTICLES)), programs, window)
-    assert_same(loss, loss_at(Objective(DifferentiableRenyiELBO(alpha=0.5, **PARTICLES)), programs, window), programs)
-
-
 def test_a_bound_with_gradients_of_its_own_leaves_those_that_exist(programs: Programs, window: Window) -> None:
     objective, bias = Objective(ReweightedWakeSleep(**PARTICLES)), programs[0].dynamics.change.head.bias
     bias.grad = torch.ones_like(bias)
@@ -207,13 +201,11 @@ def test_an_invalid_objective_is_refused(options: dict, said: str) -> None:
         Objective(**{"elbo": Trace_ELBO(), **options})
 
 
-def test_a_plain_elbo_is_an_objective_and_nothing_else_is(programs: Programs, window: Window) -> None:
+def test_a_plain_elbo_is_an_objective_and_nothing_else_is() -> None:
     bound = Trace_ELBO(num_particles=3)
     assert as_objective(bound).elbo is bound
     with pytest.raises(ValueError, match=r"objective must be of type Objective \| ELBO, not 3"):
         as_objective(3)
-    with pytest.raises(ValueError, match="set vectorize_particles=true"):
-        loss_at(Objective(DifferentiableRenyiELBO(num_particles=2)), programs, window)
 
 
 CONTACT = ("geometry=outline", "dynamics=contact", "scales=predicted", "prior=mixture", "objective=rollout")
