@@ -121,27 +121,13 @@ def _rows(tiles: Iterable[Tile]) -> list[tuple[int, int, int]]:
 
 def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
     """Border segments of a union of tiles, collinear neighbours joined, each as [low corner, high corner]."""
-    half = TILE_SIDE / 2
-    runs: dict[tuple[int, float], list[tuple[float, float]]] = {}
-    for tile in sorted(tiles):
-        center = tile_center(tile)
-        for axis in (0, 1):
-            for side in (-1, 1):
-                neighbour = (tile[0] + side, tile[1]) if axis == 0 else (tile[0], tile[1] + side)
-                if neighbour not in tiles:
-                    across, along = center[axis] + side * half, center[1 - axis]
-                    runs.setdefault((axis, round(across, 6)), []).append((along - half, along + half))
     segments = []
-    for (axis, across), pieces in sorted(runs.items()):
-        joined: list[tuple[float, float]] = []
-        for low, high in sorted(pieces):
-            if joined and abs(joined[-1][1] - low) < 1e-6:
-                joined[-1] = (joined[-1][0], high)
-            else:
-                joined.append((low, high))
-        for low, high in joined:
-            corners = [(across, low), (across, high)] if axis == 0 else [(low, across), (high, across)]
-            segments.append(corners)
+    for turn in (1, -1):  # borders between i and i + 1, then with both numbers exchanged those between j and j + 1
+        own = {(i, j)[::turn] for i, j in tiles}
+        below = {(i - 1, j) for i, j in own}
+        for i, first, last in _rows(own ^ below):
+            ends = (i + 0.5, first - 0.5), (i + 0.5, last + 0.5)
+            segments.append([tile_center(end[::turn]) for end in ends])
     return segments
 
 
