@@ -122,12 +122,11 @@ def _rows(tiles: Iterable[Tile]) -> list[tuple[int, int, int]]:
 def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
     """Border segments of a union of tiles, collinear neighbours joined, each as [low corner, high corner]."""
     segments = []
-    for turn in (1, -1):  # borders between i and i + 1, then with both numbers exchanged those between j and j + 1
-        own = {(i, j)[::turn] for i, j in tiles}
-        below = {(i - 1, j) for i, j in own}
-        for i, first, last in _rows(own ^ below):
-            ends = (i + 0.5, first - 0.5), (i + 0.5, last + 0.5)
-            segments.append([tile_center(end[::turn]) for end in ends])
+    for exchanged in (False, True):  # borders between rows i and i + 1, then between columns
+        own = {(j, i) for i, j in tiles} if exchanged else tiles
+        for i, first, last in _rows(own ^ {(i - 1, j) for i, j in own}):
+            corners = (i + 0.5, first - 0.5), (i + 0.5, last + 0.5)
+            segments.append([tile_center((y, x) if exchanged else (x, y)) for x, y in corners])
     return segments
 
 
