@@ -182,13 +182,14 @@ class DistanceField:
     From a point that is not allowed, or without such a path, it is the length of the shortest path that also crosses
     forbidden places. Between the points of the grid it is bilinear. Without a goal point it is 0 everywhere.
 
-    `allowed`, `goal`: which points of the `grid()` are, [rows, columns] bool.
+    `allowed`, `goal`: which points of the `grid()` are, [rows, columns] bool. `device`: of its numbers; points
+    elsewhere cost a copy in every call.
 
     Attributes:
         longest: metres, an upper bound on all lengths.
     """
 
-    def __init__(self, allowed: Tensor, goal: Tensor) -> None:
+    def __init__(self, allowed: Tensor, goal: Tensor, device: torch.device) -> None:
         arrived = goal.numpy()
         lengths = np.zeros(_COUNT)
         if arrived.any():
@@ -199,15 +200,9 @@ class DistanceField:
         self.longest = float(lengths.max())
         # The four corners of each cell side by side, so that one row holds all that a point needs.
         corners = [lengths[i : _COUNT[0] - 1 + i, j : _COUNT[1] - 1 + j] for i in (0, 1) for j in (0, 1)]
-        self._cells = torch.from_numpy(np.stack(corners, -1).reshape(-1, 4).astype(np.float32))
-        self._first = torch.tensor(_FIRST)
-        self._last = torch.tensor([count - 1.001 for count in _COUNT])  # within the last cell
-
-    def to(self, device: torch.device) -> DistanceField:
-        """The same field with its numbers on a device; points elsewhere cost a copy in every call."""
-        moved = copy.copy(self)
-        moved._cells, moved._first, moved._last = (part.to(device) for part in (self._cells, self._first, self._last))
-        return moved
+        self._cells = torch.from_numpy(np.stack(corners, -1).reshape(-1, 4).astype(np.float32)).to(device)
+        self._first = torch.tensor(_FIRST, device=device)
+        self._last = torch.tensor([count - 1.001 for count in _COUNT], device=device)  # within the last cell
 
     def __call__(self, points: Tensor) -> Tensor:
         """Remaining metres from points [..., 2]: [...]; off the table, those of the nearest point on it."""

@@ -83,12 +83,6 @@ class Rows:
             real &= torch.cat([way.flatten()[found] for way in ways])
         return Pairs(torch.cat((ones, others)), torch.cat((others, ones)), number.roll(len(found)), real)
 
-    def to_pairs(self, values: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """The first and the second of each pair: `[C, R]` -> `[C, P]`, twice."""
-        values = values.T.contiguous()  # whole rows of a matrix are copied faster than columns
-        first, second = (values.index_select(0, which).T.contiguous() for which in (pairs.first, pairs.second))
-        return first, second
-
     def of_pairs(self, layer: nn.Module, values: Tensor, which: Tensor) -> Tensor:
         """A layer of the first or second of each pair: a matrix `[R, W]` -> `[P, W']`."""
         if self._every:  # there are fewer rows than pairs
@@ -96,7 +90,7 @@ class Rows:
         return layer(values.index_select(0, which))
 
     def _numbers(self, chosen: Tensor) -> tuple[Tensor, int]:
-        """Numbers of the chosen, with zeros appended by at most an eighth, or to 32 (few lengths occur), and how many."""
+        """Numbers of the chosen, with zeros appended by at most an eighth, or to 32 (few lengths occur); how many."""
         if self._every:
             return torch.arange(chosen.numel(), device=chosen.device), chosen.numel()
         found = chosen.flatten().nonzero().squeeze(1)
