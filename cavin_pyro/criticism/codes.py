@@ -10,7 +10,7 @@ from pyro import poutine
 from torch import Tensor
 
 from cavin_pyro.criticism.loading import CheckContext
-from cavin_pyro.criticism.windows import WINDOWS_AT_ONCE, seeded
+from cavin_pyro.criticism.windows import batches, seeded
 from cavin_pyro.models.state import Window
 from cavin_pyro.training.elbo import Program, latent_sites, substitute, window_terms
 
@@ -29,10 +29,9 @@ def log_weights(
     float64.
     """
     pieces = []
-    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
-    for start in range(0, particles, step):
-        here = {name: value[start : start + step] for name, value in (fixed or {}).items()}
-        terms = window_terms(model, guide, window, particles=min(step, particles - start), fixed=here)
+    for some in batches(particles, window):
+        here = {name: value[some] for name, value in (fixed or {}).items()}
+        terms = window_terms(model, guide, window, particles=some.stop - some.start, fixed=here)
         pieces.append(-torch.stack([term.double() for term in terms.values()]).sum(0))
     return torch.cat(pieces)
 
@@ -41,9 +40,8 @@ def log_weights(
 def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
     """Codes `[samples, B, D]` of each window `[B]` from the guide; from the prior, if the model takes its place."""
     pieces: dict[str, list[Tensor]] = {}
-    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
-    for start in range(0, samples, step):
-        with pyro.plate("particles", min(step, samples - start), dim=-2):
+    for some in batches(samples, window):
+        with pyro.plate("particles", some.stop - some.start, dim=-2):
             trace = poutine.trace(guide).get_trace(window)
         for name, site in latent_sites(trace).items():
             pieces.setdefault(name, []).append(site["value"])
@@ -53,10 +51,9 @@ def sample_guide(guide: Program, window: Window, samples: int) -> Codes:
 @torch.no_grad()
 def guide_density(guide: Program, window: Window, values: Codes, site: str) -> Tensor:
     """log q(value | window) at one site for `values: [K, B, D]` of all sites: `[K, B]` float64."""
-    particles, pieces = len(values[site]), []
-    step = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
-    for start in range(0, particles, step):
-        here = {name: value[start : start + step] for name, value in values.items()}
+    pieces = []
+    for some in batches(len(values[site]), window):
+        here = {name: value[some] for name, value in values.items()}
         with pyro.plate("particles", len(here[site]), dim=-2):
             trace = poutine.trace(substitute(guide, here)).get_trace(window)
         trace.compute_log_prob(site_filter=lambda name, _: name == site)

@@ -71,8 +71,6 @@ def assess_elbo(context: CheckContext, *, windows: int = 1000, samples: int = 4)
     counts = {name: len(episodes) for name, (_, episodes) in parts.items()}
     total = differences[TOTAL]
     return Section(
-        "elbo",
-        "Does the bound fit held-out windows as well as training windows?",
         EXPLANATION.format(active=ACTIVE, **counts),
         conclude(
             grade(total.low, total.high, good=SMALL_LOSS, bad=LARGE_LOSS),

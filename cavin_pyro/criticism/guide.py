@@ -22,7 +22,6 @@ from cavin_pyro.models.space import unit
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program
 
-NAME, TITLE = "guide", "Is the guide calibrated?"
 INFORMED = 0.1  # a dimension counts as informed where its variance shrinks by more, given s
 LEVEL = 0.9
 EQUAL = 1e-3  # nats
@@ -56,15 +55,13 @@ def assess_guide(
     """
     window, episodes = context.held_out(windows)
     if reason := unsuitable_codes(context, window):
-        return not_applicable(NAME, TITLE, reason)
+        return not_applicable(reason)
     with seeded(context.seed):
         simulated = simulated_ranks(context.model, context.guide, window, samples=samples)
     joint = mean_interval((simulated.joint <= LEVEL).double(), episodes)
     codes = {name: code_coverage(simulated, name, episodes) for name in context.codes}
     weights = importance(context, weighted, particles)
     return Section(
-        NAME,
-        TITLE,
         EXPLANATION.format(
             windows=len(episodes),
             episodes=len(episodes.unique()),

@@ -23,7 +23,6 @@ from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import State, Window
 
-NAME, TITLE = "intervals", "Do intervals of f and h hold what they say?"
 LEVELS = (0.5, 0.9)  # of central intervals
 GOOD, BAD = (0.86, 0.95), (0.80, 0.985)  # of the coverage of 90 % intervals
 FEATURES = 8  # components of a feature to evaluate, a fixed random choice
@@ -68,8 +67,6 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
     level = worst(levels.values())
     texts = {name: f"{LABELS[name.split()[1]]} by {PREDICTORS[name.split()[0]]}" for name in scores_of}
     return Section(
-        NAME,
-        TITLE,
         EXPLANATION.format(samples=samples, windows=len(episodes), scale=length_text(space.center_scale, space)),
         conclude(
             level,

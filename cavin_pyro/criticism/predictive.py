@@ -22,7 +22,6 @@ from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.state import Window
 
-NAME, TITLE = "predictive", "Does the predictive distribution look like the data?"
 SOURCES = {
     "prior_means": "prior, as planned",
     "prior": "prior, as sampled",
@@ -82,8 +81,6 @@ def assess_predictive(context: CheckContext, *, windows: int = 400, replicates: 
     labels = {one.name: one.label for one in statistics}
     level = worst(within(one.low, one.high, good=SMALL_EFFECT, bad=LARGE_EFFECT) for one in sizes.values())
     return Section(
-        NAME,
-        TITLE,
         EXPLANATION.format(replicates=replicates, windows=len(episodes), pair=length_text(nearness.pair, context.space))
         + (TOUCH.format(tool=length_text(nearness.tool, context.space)) if nearness.tool else ""),
         conclude(

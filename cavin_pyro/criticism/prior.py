@@ -25,7 +25,6 @@ from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.elbo import Program, substitute
 
-NAME, TITLE = "prior", "Is the prior the aggregate posterior, given the state?"
 GOOD, BAD = 0.6, 0.7  # AUC
 SOURCES = {"prior": "the prior", "control": "the prior of another scene"}
 COLORS = {"guide": "#D55E00", "prior": "#0072B2", "control": "#9A9A9A"}
@@ -56,9 +55,9 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
     """
     window, episodes = context.held_out(windows)
     if reason := unsuitable_codes(context, window):
-        return not_applicable(NAME, TITLE, reason)
+        return not_applicable(reason)
     if len(episodes.unique()) < 2:
-        return not_applicable(NAME, TITLE, "All held-out windows are of one episode: collect more transitions.")
+        return not_applicable("All held-out windows are of one episode: collect more transitions.")
     with seeded(context.seed):
         inferred, prior = (sample_guide(program, window, 1) for program in (context.guide, context.model))
         codes = {"guide": {name: value[0] for name, value in inferred.items()}}
@@ -70,8 +69,6 @@ def assess_prior(context: CheckContext, *, windows: int = 1000) -> Section:
     areas = {source: area_under_curve(*pair, episodes) for source, pair in logits.items()}
     auc = areas["prior"]
     return Section(
-        NAME,
-        TITLE,
         EXPLANATION.format(windows=len(episodes), episodes=len(episodes.unique())),
         conclude(
             grade(auc.low, auc.high, good=GOOD, bad=BAD) if auc.mean == auc.mean else INSPECT,

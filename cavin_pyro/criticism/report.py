@@ -29,12 +29,15 @@ SIGNIFICANT_DIGITS = 6
 IN_JSON = ("title", "verdict", "measure", "number", "findings", "values")
 
 Part = dict[str, Any]
-"""A rendered section, JSON-ready: the fields of `Section`, with its figure as an image."""
+"""A rendered section, JSON-ready: its name and title, and the fields of `Section`, with its figure as an image."""
 
 
-def render(section: Section) -> Part:
+def render(name: str, title: str, section: Section) -> Part:
     """Turn the figure into an image and numbers into plain ones, so that a section can be stored on disk."""
-    return {name: value for name, value in vars(section).items() if name != "figure"} | {
+    return {
+        "name": name,
+        "title": title,
+        **{key: value for key, value in vars(section).items() if key != "figure"},
         "verdict": asdict(section.verdict),
         "number": plain(section.number),
         "findings": list(section.findings),

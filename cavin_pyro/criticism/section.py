@@ -40,7 +40,7 @@ class Section:
     """One section of the report.
 
     Attributes:
-        name: key in report.json. title: the question. explanation: the measurement, its data, and how to read it.
+        explanation: the measurement, its data, and how to read it.
         verdict: good, inspect or bad, by which rule, and what to do next.
         findings: of this run, a sentence each, derived from the values.
         values: for report.json: numbers, strings, intervals, lists and dictionaries of them.
@@ -48,8 +48,6 @@ class Section:
         figure, caption: drawn in the report.
     """
 
-    name: str
-    title: str
     explanation: str
     verdict: Verdict
     findings: Sequence[str] = ()
@@ -60,9 +58,9 @@ class Section:
     caption: str = ""
 
 
-def not_applicable(name: str, title: str, reason: str) -> Section:
+def not_applicable(reason: str) -> Section:
     """The section of a model that has nothing of the kind."""
-    return Section(name, title, "", Verdict(NONE, reason), [reason])
+    return Section("", Verdict(NONE, reason), [reason])
 
 
 def grade(low: float, high: float, *, good: float, bad: float) -> str:

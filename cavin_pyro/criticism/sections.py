@@ -22,14 +22,14 @@ from cavin_pyro.criticism.subgoals import assess_subgoals
 from cavin_pyro.storage.files import clear_abandoned, read_json, write_json
 from cavin_pyro.storage.provenance import program_fingerprint
 
-# In the order of the report. Each takes the context and the options `sizes.<name>`.
-SECTIONS: dict[str, Callable[..., Section]] = {
-    "elbo": assess_elbo,
-    "guide": assess_guide,
-    "prior": assess_prior,
-    "predictive": assess_predictive,
-    "intervals": assess_intervals,
-    "subgoals": assess_subgoals,
+# In the order of the report: the question of each, and what answers it with the context and the options `sizes.<name>`.
+SECTIONS: dict[str, tuple[str, Callable[..., Section]]] = {
+    "elbo": ("Does the bound fit held-out windows as well as training windows?", assess_elbo),
+    "guide": ("Is the guide calibrated?", assess_guide),
+    "prior": ("Is the prior the aggregate posterior, given the state?", assess_prior),
+    "predictive": ("Does the predictive distribution look like the data?", assess_predictive),
+    "intervals": ("Do intervals of f and h hold what they say?", assess_intervals),
+    "subgoals": ("Do motions reach their subgoals in the simulator?", assess_subgoals),
 }
 
 
@@ -65,7 +65,8 @@ def run_sections(
         if part is None:
             pyro.set_rng_seed(context.seed)
             arguments = {str(key): value for key, value in sizes.get(name, {}).items() if key != "_target_"}
-            part = render(SECTIONS[name](context, **arguments))
+            title, assess = SECTIONS[name]
+            part = render(name, title, assess(context, **arguments))
             write_json(kept / f"{name}.json", {"fingerprint": fingerprint, "part": part})
         parts.append(part)
     return parts

@@ -41,7 +41,6 @@ from cavin_pyro.storage.progress import progress_bar
 SAMPLED, CLOSEST, GIVEN = "sampled", "closest", "given by the effect"  # how a motion is obtained
 
 Floats = NDArray[np.floating]
-NAME, TITLE = "subgoals", "Do motions reach their subgoals in the simulator?"
 MOVING = 2.0  # scales of centres; objects that a subgoal moves less are not among those that it wants moved
 NEAR, FAR = 0.35, 0.65  # of the way to the subgoal that is left
 COLORS = ("#D55E00", "#0072B2")
@@ -75,14 +74,14 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
         samples: N, candidates for the closest motion.
     """
     if context.world is None:
-        return not_applicable(NAME, TITLE, "The simulator is not known: give the world of the data (env=).")
+        return not_applicable("The simulator is not known: give the world of the data (env=).")
     space, table = context.space, not isinstance(context.world, World)
     if table:
         check_objects(context.model, objects)
     if not context.codes:
-        return not_applicable(NAME, TITLE, f"{NO_CODES} It generates no actions.")
+        return not_applicable(f"{NO_CODES} It generates no actions.")
     if others := [name for name in context.codes if name not in SYMBOLS]:
-        return not_applicable(NAME, TITLE, f"{', '.join(others)}: planning samples effect_code and motion_code alone.")
+        return not_applicable(f"{', '.join(others)}: planning samples effect_code and motion_code alone.")
     groups: dict[str, list[SubgoalRollout]] = {}
     with progress_bar("executing", total=scenes, unit="scene") as bar:
         for rollouts in subgoal_rollouts(context, scenes=scenes, objects=objects, samples=samples):
@@ -95,8 +94,6 @@ def assess_subgoals(context: CheckContext, *, scenes: int = 150, objects: int = 
     best = f"motion {motions(context.codes)[-1]}"
     left = measured[best].get("left")
     return Section(
-        NAME,
-        TITLE,
         EXPLANATION.format(scenes=scenes, samples=samples, moving=length_text(MOVING * space.center_scale, space))
         + (PUSHES.format(objects=objects) if table else ""),
         Verdict(NONE, "The model has no subgoals.")

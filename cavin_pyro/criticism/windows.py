@@ -86,13 +86,18 @@ def all_pushes(values: Mapping[str, Tensor], site: str) -> Tensor:
     return torch.stack(steps, -3)
 
 
+def batches(samples: int, window: Window) -> list[slice]:
+    """The parts of so many samples of windows `[B]` that are computed at once."""
+    each = max(1, WINDOWS_AT_ONCE // max(1, len(window.actions)))
+    return [slice(start, min(start + each, samples)) for start in range(0, samples, each)]
+
+
 def replicated(window: Window, copies: int, make: Callable[[Window], Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """What `make` makes, by name, of copies of windows `[B]`, in batches of some copies: `[copies, B, ...]`."""
     # Longer batches instead of a further dimension: they suit every model, and cost the same.
-    each = max(1, min(copies, WINDOWS_AT_ONCE // len(window.actions)))
     parts: dict[str, list[Tensor]] = {}
-    for made in range(0, copies, each):
-        count = min(each, copies - made)
+    for some in batches(copies, window):
+        count = some.stop - some.start
         batch = window.map(lambda field, count=count: field.repeat(count, *[1] * (field.dim() - 1)))  # type: ignore[misc]
         for name, values in make(batch).items():
             parts.setdefault(name, []).append(values.unflatten(0, (count, -1)))

@@ -168,7 +168,11 @@ class ActionGenerator(nn.Module):
         self.pool = ObjectPool(width)
         self.transform = None if motion_dimension is None else nn.Linear(width, 2 * motion_dimension)
         for name, size in zip(space.action_names, space.action_sizes, strict=True):
-            layers = _numbers(motion_dimension or width, segment_length, size, width)
+            layers = nn.Sequential(
+                fully_connected(motion_dimension or width, width),
+                nn.Linear(width, size * segment_length),
+                nn.Unflatten(-1, (segment_length, size)),  # `size` numbers for each of the T actions
+            )
             self.add_module(f"{name}s", layers)
 
     def forward(self, effect: Tensor, state: State, motion_code: Tensor | None = None) -> Tensor:
@@ -188,15 +192,6 @@ class ActionGenerator(nn.Module):
             for name, limit in zip(self.space.action_names, self.space.action_limits, strict=True)
         ]
         return self.space.turn_actions(torch.cat(parts, -1), state, back=True)
-
-
-def _numbers(inputs: int, segment_length: int, size: int, width: int) -> nn.Sequential:
-    """`size` numbers for each of the T actions: `[..., inputs] -> [..., T, size]`."""
-    return nn.Sequential(
-        fully_connected(inputs, width),
-        nn.Linear(width, size * segment_length),
-        nn.Unflatten(-1, (segment_length, size)),
-    )
 
 
 def _limited(values: Tensor, limit: float) -> Tensor:

@@ -12,7 +12,7 @@ images in which it is in contact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +94,8 @@ def match_together(
         region = owners == index
         if region.sum() * CELL**2 >= MINIMUM_AREA:
             fits = arrangement.saved(index) >= RECOGNISED * shape.area
-            found[number] = Match(region, arrangement.placed(index).shifted(row, column) if fits else None)
+            placed = replace(shape, pose=arrangement.poses[index]).shifted(row, column) if fits else None
+            found[number] = Match(region, placed)
     return found | _left_over({n: shape for n, shape in moved.items() if n not in found}, found, concerned, heights)
 
 
@@ -174,7 +175,9 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
     }
     moved = {number: track.shape for number, track in known.items() if number not in standing}
     taken = np.any([known[number].region for number in standing] or [np.zeros_like(heights.occupied)], axis=0)
-    pieces = _pieces(taken, heights)
+    # Noise makes outlines flicker: a thin seam around an unmoved object belongs to it.
+    seams = ndimage.binary_dilation(taken, AROUND)
+    pieces = _connected(ndimage.binary_closing(heights.occupied & ~seams, AROUND) & ~seams)
     found = standing
     if moved and pieces:
         near = ndimage.binary_dilation(taken, AROUND, iterations=TOUCHING)
@@ -185,13 +188,6 @@ def follow_tracks(tracks: Sequence[Track | None], heights: HeightMap) -> list[Tr
         _remembered(number, regions, found[number].shape, heights) if number in regions else None
         for number in range(len(tracks))
     ]
-
-
-def _pieces(taken: Mask, heights: HeightMap) -> list[Mask]:
-    """Regions of the map large enough for an object, outside of the cells `taken` by unmoved objects."""
-    # Noise makes outlines flicker: a thin seam around an unmoved object belongs to it.
-    seams = ndimage.binary_dilation(taken, AROUND)
-    return _connected(ndimage.binary_closing(heights.occupied & ~seams, AROUND) & ~seams)
 
 
 def _connected(cells: Mask) -> list[Mask]:

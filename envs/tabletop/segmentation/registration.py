@@ -132,10 +132,6 @@ class Arrangement:
         for number in range(len(self.shapes)):
             self.place(number, poses.get(number))
 
-    def placed(self, number: int) -> Shape:
-        """A placed shape."""
-        return replace(self.shapes[number], pose=self.poses[number])
-
     def savings(self, number: int) -> Table:
         """Savings from this shape, given the others."""
         cost, covered = np.ones(len(self._misfit), np.float32), np.zeros(len(self._misfit), np.bool_)

@@ -50,8 +50,5 @@ class MaskSegmenter:
 
     def follow(self, image: DepthImage) -> list[Pixels]:
         measured = image.depth > 0.0
-        found = []
-        for mask in self._true_masks():
-            rows, columns = np.nonzero(mask & measured)
-            found.append((rows, columns))
-        return found
+        found = (np.nonzero(mask & measured) for mask in self._true_masks())
+        return [(rows, columns) for rows, columns in found]

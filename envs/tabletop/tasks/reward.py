@@ -63,7 +63,7 @@ class DistanceToGoal:
         if self._own_goals is not None:
             return
         outcome = outcome_alone(reward, grid())
-        self._field = DistanceField(~outcome.failure, outcome.success).to(reward.device)
+        self._field = DistanceField(~outcome.failure, outcome.success, reward.device)
 
     def __call__(self, centers: Tensor, mask: Tensor) -> Tensor:
         """Metres left: [...], from centers [..., M, 3] metres and mask [..., M] bool; object 0 is the target."""

@@ -121,27 +121,12 @@ def _rows(tiles: Iterable[Tile]) -> list[tuple[int, int, int]]:
 
 def _outline(tiles: set[Tile]) -> list[list[tuple[float, float]]]:
     """Border segments of a union of tiles, collinear neighbours joined, each as [low corner, high corner]."""
-    half = TILE_SIDE / 2
-    runs: dict[tuple[int, float], list[tuple[float, float]]] = {}
-    for tile in sorted(tiles):
-        center = tile_center(tile)
-        for axis in (0, 1):
-            for side in (-1, 1):
-                neighbour = (tile[0] + side, tile[1]) if axis == 0 else (tile[0], tile[1] + side)
-                if neighbour not in tiles:
-                    across, along = center[axis] + side * half, center[1 - axis]
-                    runs.setdefault((axis, round(across, 6)), []).append((along - half, along + half))
     segments = []
-    for (axis, across), pieces in sorted(runs.items()):
-        joined: list[tuple[float, float]] = []
-        for low, high in sorted(pieces):
-            if joined and abs(joined[-1][1] - low) < 1e-6:
-                joined[-1] = (joined[-1][0], high)
-            else:
-                joined.append((low, high))
-        for low, high in joined:
-            corners = [(across, low), (across, high)] if axis == 0 else [(low, across), (high, across)]
-            segments.append(corners)
+    for exchanged in (False, True):  # borders between rows i and i + 1, then between columns
+        own = {(j, i) for i, j in tiles} if exchanged else tiles
+        for i, first, last in _rows(own ^ {(i - 1, j) for i, j in own}):
+            corners = (i + 0.5, first - 0.5), (i + 0.5, last + 0.5)
+            segments.append([tile_center((y, x) if exchanged else (x, y)) for x, y in corners])
     return segments
 
 
@@ -197,13 +182,14 @@ class DistanceField:
     From a point that is not allowed, or without such a path, it is the length of the shortest path that also crosses
     forbidden places. Between the points of the grid it is bilinear. Without a goal point it is 0 everywhere.
 
-    `allowed`, `goal`: which points of the `grid()` are, [rows, columns] bool.
+    `allowed`, `goal`: which points of the `grid()` are, [rows, columns] bool. `device`: of its numbers; points
+    elsewhere cost a copy in every call.
 
     Attributes:
         longest: metres, an upper bound on all lengths.
     """
 
-    def __init__(self, allowed: Tensor, goal: Tensor) -> None:
+    def __init__(self, allowed: Tensor, goal: Tensor, device: torch.device) -> None:
         arrived = goal.numpy()
         lengths = np.zeros(_COUNT)
         if arrived.any():
@@ -214,15 +200,9 @@ class DistanceField:
         self.longest = float(lengths.max())
         # The four corners of each cell side by side, so that one row holds all that a point needs.
         corners = [lengths[i : _COUNT[0] - 1 + i, j : _COUNT[1] - 1 + j] for i in (0, 1) for j in (0, 1)]
-        self._cells = torch.from_numpy(np.stack(corners, -1).reshape(-1, 4).astype(np.float32))
-        self._first = torch.tensor(_FIRST)
-        self._last = torch.tensor([count - 1.001 for count in _COUNT])  # within the last cell
-
-    def to(self, device: torch.device) -> DistanceField:
-        """The same field with its numbers on a device; points elsewhere cost a copy in every call."""
-        moved = copy.copy(self)
-        moved._cells, moved._first, moved._last = (part.to(device) for part in (self._cells, self._first, self._last))
-        return moved
+        self._cells = torch.from_numpy(np.stack(corners, -1).reshape(-1, 4).astype(np.float32)).to(device)
+        self._first = torch.tensor(_FIRST, device=device)
+        self._last = torch.tensor([count - 1.001 for count in _COUNT], device=device)  # within the last cell
 
     def __call__(self, points: Tensor) -> Tensor:
         """Remaining metres from points [..., 2]: [...]; off the table, those of the nearest point on it."""

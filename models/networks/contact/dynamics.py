@@ -205,7 +205,7 @@ class ContactDynamics(Outcome):
         motion = self.alone(alone).T.contiguous()
         relation = each.new_zeros(len(each), self.pair.out_features)
         if pairs is not None:
-            measures = pair_contact(place, outline, *_aim(motion.detach()), rows, pairs)
+            measures = pair_contact(place, outline, *_aim(motion.detach()), pairs)
             hidden = self.pair(measures.T)
             hidden = hidden + rows.of_pairs(self.own, each, pairs.first) + rows.of_pairs(self.other, each, pairs.second)
             related = self.relation(hidden.relu_()) * pairs.real.unsqueeze(-1)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from cavin_pyro.models.networks.contact.rows import Pairs, Rows
+from cavin_pyro.models.networks.contact.rows import Pairs
 from cavin_pyro.models.networks.outline import (
     DIRECTIONS,
     HARMONICS,
@@ -107,7 +107,7 @@ def endpoints(action: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     return start, end - start
 
 
-def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, rows: Rows, pairs: Pairs) -> Tensor:
+def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, pairs: Pairs) -> Tensor:
     """Measures of pairs of objects, of which the tool would carry each along its aim, a direction of its own.
 
     The way until a carried object meets another is their distance along the aim, less how far both reach in that
@@ -116,7 +116,7 @@ def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, 
     Args:
         place: `[2, R]` metres, centres in axes of the push. outlines: `[2 K + 1, R]`, in the same axes.
         aim: `[2, R]` vectors of any length. carried: `[R]` metres along the aim, 0 without contact.
-        rows, pairs: tell which objects these are.
+        pairs: tells which objects these are.
 
     Returns `[PAIR_MEASURES, P]` of object i and another j, in units of `DISPLACEMENT_UNIT`: where i is, seen from j,
     and where j would push it; if j were carried: the way until it meets i, the gap between them across the aim, how far
@@ -124,9 +124,10 @@ def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, 
     """
     cosines, sines = multiples(*aim)
     sizes = 2, PER_OUTLINE, HARMONICS, HARMONICS, 1
-    each = torch.cat((place, outlines, cosines, sines, carried.unsqueeze(0)))
+    # Whole rows of a matrix are copied faster than columns.
+    each = torch.cat((place, outlines, cosines, sines, carried.unsqueeze(0))).T.contiguous()
     (place, outline, *_), (own_place, own_outline, cosines, sines, carried) = (
-        one.split(sizes) for one in rows.to_pairs(each, pairs)
+        each.index_select(0, which).T.contiguous().split(sizes) for which in (pairs.first, pairs.second)
     )
     extents = supports(torch.stack((own_outline, outline), 1), cosines.unsqueeze(1), sines.unsqueeze(1))
     (own_ahead, _), (_, behind), (own_left, left), (own_right, right) = extents

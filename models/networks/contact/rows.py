@@ -33,13 +33,7 @@ class Rows:
         """`counting: [M, ...]` bool."""
         objects, *pushes = self._all = (*counting.shape,)
         self._counting, self._every = counting.reshape(objects, -1), every
-        if every:
-            found = torch.arange(counting.numel(), device=counting.device)
-            self._count = len(found)
-        else:
-            found = self._counting.flatten().nonzero().squeeze(1)
-            self._count = len(found)
-            found = _rounded_up(found)
+        found, self._count = self._numbers(self._counting)
         self._found = found  # numbers of [M, ...]
         count = max(1, prod(pushes))
         self._pushes = found.remainder(count)
@@ -75,12 +69,7 @@ class Rows:
             orders = (first, second), (second, first)
             ways = [way & near[order].flatten(1) for way, order in zip(ways, orders, strict=True)]
             both &= ways[0] | ways[1]
-        if self._every:
-            found = torch.arange(both.numel(), device=both.device)
-            count = len(found)
-        else:
-            found = both.flatten().nonzero().squeeze(1)
-            count, found = len(found), _rounded_up(found)
+        found, count = self._numbers(both)
         if not count:
             return None
         which, push = found.div(pushes, rounding_mode="floor"), found.remainder(pushes)
@@ -94,17 +83,19 @@ class Rows:
             real &= torch.cat([way.flatten()[found] for way in ways])
         return Pairs(torch.cat((ones, others)), torch.cat((others, ones)), number.roll(len(found)), real)
 
-    def to_pairs(self, values: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """The first and the second of each pair: `[C, R]` -> `[C, P]`, twice."""
-        values = values.T.contiguous()  # whole rows of a matrix are copied faster than columns
-        first, second = (values.index_select(0, which).T.contiguous() for which in (pairs.first, pairs.second))
-        return first, second
-
     def of_pairs(self, layer: nn.Module, values: Tensor, which: Tensor) -> Tensor:
         """A layer of the first or second of each pair: a matrix `[R, W]` -> `[P, W']`."""
         if self._every:  # there are fewer rows than pairs
             return layer(values).index_select(0, which)
         return layer(values.index_select(0, which))
+
+    def _numbers(self, chosen: Tensor) -> tuple[Tensor, int]:
+        """Numbers of the chosen, with zeros appended by at most an eighth, or to 32 (few lengths occur); how many."""
+        if self._every:
+            return torch.arange(chosen.numel(), device=chosen.device), chosen.numel()
+        found = chosen.flatten().nonzero().squeeze(1)
+        count = len(found)
+        return functional.pad(found, (0, -count % 2 ** max(5, count.bit_length() - 4))), count
 
     def _matrix(self, values: Tensor) -> Tensor:
         """A row for each object of each push, objects last."""
@@ -126,9 +117,3 @@ def near_pairs(place: Tensor, real: Tensor, most: int | None) -> Tensor | None:
     if most is None or len(real) - 1 <= most:
         return None
     return nearest_pairs(place.movedim((0, 1), (-1, -2)), real.movedim(0, -1), most).movedim((-2, -1), (0, 1))
-
-
-def _rounded_up(numbers: Tensor) -> Tensor:
-    """`[R]` with zeros appended, by at most an eighth, or to 32: few lengths occur."""
-    count = len(numbers)
-    return functional.pad(numbers, (0, -count % 2 ** max(5, count.bit_length() - 4)))

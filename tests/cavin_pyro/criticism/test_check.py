@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -188,9 +189,9 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def assess(context: CheckContext, *, name: str) -> Section:
         ran.append(name)
         sampled = [float(torch.rand(())), float(np.random.rand())]  # noqa: NPY002
-        return Section(name, name, "", Verdict("none", ""), values={"sampled": sampled})
+        return Section("", Verdict("none", ""), values={"sampled": sampled})
 
-    both = {"one": lambda context: assess(context, name="one"), "two": lambda context: assess(context, name="two")}
+    both = {name: (name, partial(assess, name=name)) for name in ("one", "two")}
     monkeypatch.setattr(sections, "SECTIONS", both)
     return ran
 

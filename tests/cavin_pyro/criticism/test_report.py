@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 
 from cavin_pyro.criticism.estimates import Interval
-from cavin_pyro.criticism.report import page, plain, render, write_report
+from cavin_pyro.criticism.report import Part, page, plain, render, write_report
 from cavin_pyro.criticism.section import Section, Verdict
 
 ABOUT: dict[str, Any] = {
@@ -49,12 +49,10 @@ class Reader(HTMLParser):
         self.text += data
 
 
-def section(**changes: Any) -> Section:
+def section(name: str = "first", **changes: Any) -> Part:
     figure = Figure(figsize=(2, 1))
     figure.subplots().plot([0, 1], [1, 0])
     whole: dict[str, Any] = {
-        "name": "first",
-        "title": "A <script>alert(1)</script> & title",
         "explanation": "One <em>.",
         "verdict": Verdict("inspect", "By <s>rule</s>.", "Do <i>this</i>."),
         "findings": ['It is "<b>bold</b>".'],
@@ -64,11 +62,11 @@ def section(**changes: Any) -> Section:
         "figure": figure,
         "caption": "Lines <u>.",
     }
-    return Section(**{**whole, **changes})
+    return render(name, "A <script>alert(1)</script> & title", Section(**{**whole, **changes}))
 
 
 def test_the_page_is_valid_html_that_needs_nothing_else_and_escapes_what_it_shows() -> None:
-    html = page(ABOUT, [render(section()), render(section(name="second", figure=None, number=None))])
+    html = page(ABOUT, [section(), section("second", figure=None, number=None)])
     reader = Reader(html)
     assert all(reference.startswith(("data:image/svg", "#")) for reference in reader.references)
     assert {"#first", "#second"} < set(reader.references) and len(reader.references) == 3
@@ -79,7 +77,7 @@ def test_the_page_is_valid_html_that_needs_nothing_else_and_escapes_what_it_show
 
 
 def test_the_data_is_valid_json_of_finite_numbers(tmp_path: Path) -> None:
-    write_report(tmp_path, ABOUT, [render(section())])
+    write_report(tmp_path, ABOUT, [section()])
 
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
@@ -92,7 +90,7 @@ def test_the_data_is_valid_json_of_finite_numbers(tmp_path: Path) -> None:
 
 
 def test_a_rendered_section_survives_the_disk_and_other_values_are_refused() -> None:
-    part = render(section())
-    assert json.loads(json.dumps(part)) == part == render(section())
+    part = section()
+    assert json.loads(json.dumps(part)) == part == section()
     with pytest.raises(TypeError, match="PosixPath"):
         plain({"folder": [Path("here")]})

@@ -278,7 +278,7 @@ def test_a_disc_ahead_is_met_after_the_distance_between_both_and_pushed_for_the_
         rows = Rows(torch.ones(2, dtype=torch.bool), every=True)
         pairs = rows.pairs(None)
         assert pairs is not None
-        found = pair_contact(place, discs(0.03, 0.02), aims, torch.tensor([0.05, 0.0]), rows, pairs)
+        found = pair_contact(place, discs(0.03, 0.02), aims, torch.tensor([0.05, 0.0]), pairs)
         assert found.shape == (PAIR_MEASURES, 2)
         table = dict(zip(pairs.first.tolist(), (DISPLACEMENT_UNIT * found).T.tolist(), strict=True))
         _, _, push_x, push_y, meet, gap, push, *_ = table[1]
