@@ -201,8 +201,12 @@ class Goal(ABC):
     def __call__(self, previous: Tensor, values: Tensor, mask: Tensor) -> Outcome:
         """The outcome of steps from `previous` to `values: [..., M, P + F]`, `mask: [..., M]`: `[...]`."""
         state = self._state(values, mask)
-        success = self.success(state)
-        failure = self.failure(state) & ~success
+        success, failed = self.success(state), self.failure(state)
+        for name, found in (("success", success), ("failure", failed)):
+            if getattr(found, "dtype", None) != torch.bool:
+                wanted = f"bool {list(mask.shape[:-1])}"
+                raise ValueError(f"{type(self).__name__}: {name} must give {wanted}, not {told(found)}")
+        failure = failed & ~success
         reward = STEP_REWARD + GOAL_REWARD * (success.float() - failure.float())
         if self.weight:
             reward = reward + self.weight * (self.distance(self._state(previous, mask)) - self.distance(state))
@@ -278,7 +282,7 @@ def check_goal(world: World, goal: Any, state: State) -> None:
     try:
         values = one.values(getattr(goal, "reads_features", False))
         outcome = goal(values, values, one.mask)
-    except (RuntimeError, TypeError, AttributeError) as error:
+    except (RuntimeError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{name}: its goal does not fit states [{plans}]: {str(error).splitlines()[0]}") from error
     for field in ("success", "failure", "reward"):  # the reward is made of the others
         value = getattr(outcome, field, None)

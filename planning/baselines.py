@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_number, typed
+from cavin_pyro.models.checks import check_number, told, typed
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.additions import Choice
 from cavin_pyro.planning.cavin import EffectSpace
@@ -290,8 +290,9 @@ class PolicyPlanner:
             actions = self.policy(state.map(lambda field: field[0]), as_reward(reward), observed)
         except ValueError as error:
             raise UnsuitedError(str(error)) from error
-        if actions.shape != (1, self.action_dimension):
-            raise ValueError(f"a policy must give an action [1, {self.action_dimension}], not {list(actions.shape)}")
+        given = list(actions.shape) if isinstance(actions, Tensor) else told(actions)
+        if given != [1, self.action_dimension]:
+            raise ValueError(f"a policy must give an action [1, {self.action_dimension}], not {given}")
         return actions[None]
 
 

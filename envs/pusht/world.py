@@ -229,7 +229,7 @@ class PushT(World):
 
     def move_goals(self, goals: NDArray[np.float64]) -> None:
         """See `World`: the disc's place at the goal moves with the block's, and stays in the window."""
-        block = np.array(goals[0], dtype=np.float64)
+        block = finite_numbers("the goal of the T", np.reshape(goals, -1), 3)
         corners = outline_of(np.array([0.0, 0.0, *block]))
         if not ((corners > 0) & (corners < SIZE)).all():
             raise ValueError("the goal of the T must lie within the walls")
@@ -282,6 +282,8 @@ class PushT(World):
     def _set(self, state: NDArray[np.float64]) -> None:
         """Put disc and block (5 or 7 numbers) into a fresh space; whatever is set, it has the same past."""
         simulator = self._simulator
+        if not ((state[:4] >= -SIZE) & (state[:4] <= 2 * SIZE)).all():
+            raise ValueError(f"a state must lie in the window, from 0 to {SIZE:g} pixels, not {state.tolist()}")
         simulator.reset(seed=0, options={"reset_to_state": [50.0, 50.0, 256.0, 256.0, 0.0]})
         agent, block = simulator.agent, simulator.block
         numbers = state.tolist()

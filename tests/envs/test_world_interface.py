@@ -45,6 +45,11 @@ class Slips(Far):
         return state.centers[..., 0] > 1
 
 
+class Counts(Far):
+    def success(self, state: State) -> Tensor:
+        return state.centers[..., 0, 0]
+
+
 class Line(World):
     """A point on a line, whose feature is a direction and a number that is free."""
 
@@ -102,6 +107,7 @@ def states(*places: float) -> Tensor:
         ({"step": lambda world, _: (0.0, math.nan, False, False, SAID)}, "must give a finite reward, .*, not nan"),
         ({"state": lambda world, place: (0.0, 0.0, REAL)}, r"state must be of type State, not \(0.0"),
         ({"goal": lambda world, *_: None}, r"its goal does not fit states \[5\]: 'NoneType' object is not callable"),
+        ({"goal": lambda world, *_: Counts(SPACE)}, r"success must give bool \[5\], not"),
         ({"goal": lambda world, *_: Slips(SPACE)}, r"its goal must give success as bool \[5\], not bool \[5, 1\]$"),
     ],
 )

@@ -272,6 +272,8 @@ def test_a_policy_acts_in_one_scene_with_an_action_of_the_world(toy: SimpleNames
     assert plan.actions.tolist() == [[[0.25, 0.5, 1.0, 1.0]]] and plan.share_reaching_goal is None
     with pytest.raises(ValueError, match=r"must give an action \[1, 3\], not \[1, 4\]"):
         PolicyPlanner(push, action_dimension=3).plan(state, reward=reward, generators=toy.generators(0))
+    with pytest.raises(ValueError, match=r"must give an action \[1, 4\], not \[0.5\]"):
+        PolicyPlanner(lambda *_: [0.5], action_dimension=4).plan(state, reward=reward, generators=toy.generators(0))
     with pytest.raises(ValueError, match="one scene at a time, not in 2"):
         PolicyPlanner(push, action_dimension=4).plan(
             toy.scenes([[(0.0, 0.0)]] * 2), reward=reward, generators=toy.generators(0, 1)
