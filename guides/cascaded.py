@@ -24,12 +24,7 @@ class CascadedGuide(Guide):
     fits = ("cascaded",)
 
     def __init__(
-        self,
-        model: Model,
-        *,
-        width: int = 64,
-        effect_reads_actions: bool = False,
-        motion_reads_effect: bool = True,
+        self, model: Model, *, width: int = 64, effect_reads_actions: bool = False, motion_reads_effect: bool = True
     ) -> None:
         """The inference networks. For `model` and `width` see `Guide`.
 

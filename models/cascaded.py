@@ -54,10 +54,7 @@ class CascadedModel(Model):
         self.effect_dimension = effect_dimension
         self.motion_dimension = motion_dimension
         self.meta_dynamics = MetaDynamics(
-            self.space,
-            effect_dimension=effect_dimension,
-            feature_dimension=self.feature_dimension,
-            width=self.width,
+            self.space, effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
         )
         self.action_generator = ActionGenerator(
             self.space, segment_length=self.segment_length, motion_dimension=motion_dimension, width=self.width

@@ -94,12 +94,6 @@ class PredictedScales(LikelihoodScales):
     degrees_of_freedom: float = 3.0
     height_ratio: float = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        IsotropicStudentT(
-            self.degrees_of_freedom, torch.zeros(1), torch.ones(()), self.height_ratio
-        )  # raises its errors
-
     def _around(
         self, mean: Tensor, scale: float | Tensor, predicted: Tensor | None, *, of_centers: bool = False
     ) -> Isotropic:

@@ -57,10 +57,7 @@ class SingleLatentModel(Model):
         self.effect_dimension = effect_dimension
         self.action_weight = action_weight
         self.meta_dynamics = MetaDynamics(
-            self.space,
-            effect_dimension=effect_dimension,
-            feature_dimension=self.feature_dimension,
-            width=self.width,
+            self.space, effect_dimension=effect_dimension, feature_dimension=self.feature_dimension, width=self.width
         )
         self.action_generator = ActionGenerator(
             self.space, segment_length=self.segment_length, motion_dimension=None, width=self.width

@@ -53,9 +53,8 @@ class CavinPlanner(SearchingPlanner):
         check_number("feature_weight", self.feature_weight)
         check_number("motion_share", motion_share, high=1, positive=True)
         self.motion_samples = max(1, int(motion_share * samples))
-        argument, samples = "motion_optimizer", self.motion_samples
         self.motion_optimizer = make_optimizer(
-            motion_optimizer or self.optimizer, samples=samples, argument=argument, size="motion_share: "
+            motion_optimizer or self.optimizer, samples=self.motion_samples, argument="motion_optimizer"
         )
         self.whole_horizon = motion_horizon == "full_horizon"
 

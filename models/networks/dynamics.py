@@ -98,12 +98,7 @@ class Dynamics(Outcome):
     """f as in the paper: the mean of the state after one action."""
 
     def __init__(
-        self,
-        space: Space,
-        *,
-        feature_dimension: int = 64,
-        width: int = 64,
-        maximum_displacement: float | None = None,
+        self, space: Space, *, feature_dimension: int = 64, width: int = 64, maximum_displacement: float | None = None
     ) -> None:
         """The layers.
 

@@ -16,9 +16,7 @@ __all__ = ["CEM", "ICEM", "MPPI", "OPTIMIZERS", "SMC", "Optimizer", "Shooting", 
 OPTIMIZERS: dict[str, type[Optimizer]] = {"shooting": Shooting, "cem": CEM, "icem": ICEM, "mppi": MPPI, "smc": SMC}
 
 
-def make_optimizer(
-    optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer", size: str = ""
-) -> Optimizer:
+def make_optimizer(optimizer: str | Optimizer, *, samples: int, argument: str = "optimizer") -> Optimizer:
     """The optimizer of that name, with its defaults, or the given one; `argument` is what errors call it.
 
     Raises ValueError, naming the valid ones, for an unknown name or an object that is no optimizer, and for fewer
@@ -33,5 +31,5 @@ def make_optimizer(
             f"optimize(problem, samples), not {optimizer!r}"
         )
     if isinstance(optimizer, CEM | MPPI):
-        samples_of_iteration(samples, optimizer.iterations, 0, size)
+        samples_of_iteration(samples, optimizer.iterations, 0)
     return optimizer

@@ -55,11 +55,11 @@ def best(population: Population, count: int) -> Population:
     return records.take(population, population.returns.topk(min(count, population.returns.shape[-1]), -1).indices)
 
 
-def samples_of_iteration(samples: int, iterations: int, number: int, size: str = "") -> int:
+def samples_of_iteration(samples: int, iterations: int, number: int) -> int:
     """The number of the N = `samples` for iteration `number` of `iterations`; the first iterations take the remainder.
 
-    Raises ValueError, which begins with `size`, if there are fewer samples than iterations.
+    Raises ValueError if there are fewer samples than iterations.
     """
     if samples < iterations:
-        raise ValueError(f"{size}{iterations} iterations need at least as many samples, not {samples}")
+        raise ValueError(f"{iterations} iterations need at least as many samples (see motion_share), not {samples}")
     return samples // iterations + (number < samples % iterations)

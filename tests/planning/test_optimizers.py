@@ -126,7 +126,7 @@ def test_what_is_no_optimizer_is_refused_in_one_line() -> None:
 
 @pytest.mark.parametrize("name", ["cem", "icem", "mppi"])
 def test_fewer_samples_than_iterations_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="^4 iterations need at least as many samples, not 3$"):
+    with pytest.raises(ValueError, match="^4 iterations need at least as many samples .*, not 3$"):
         make_optimizer(name, samples=3)
 
 

@@ -106,10 +106,7 @@ def arrange(areas: Sequence[Area], clearance: float, generator: np.random.Genera
 
 
 def sample_objects(
-    areas: Sequence[Area],
-    ranges: ObjectRanges,
-    generator: np.random.Generator,
-    objects: ObjectSet = BUILTIN,
+    areas: Sequence[Area], ranges: ObjectRanges, generator: np.random.Generator, objects: ObjectSet = BUILTIN
 ) -> list[ObjectParameters]:
     """Sample one object per area, in random orientation, above the table and clear of its neighbours.
 
