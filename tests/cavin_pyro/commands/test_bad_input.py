@@ -31,7 +31,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     (
         "plan",
         "planner.optimizer=cem planner.motion_share=0.001",
-        "planner.motion_share=0.001: 4 iterations need as many samples",
+        "4 iterations need at least as many samples (see motion_share), not 1",
     ),
     ("plan", "planner.samples=64 pushes_per_plan=9", "error: pushes_per_plan must be "),
     ("check", "sizes.elbo=null", "sizes.elbo is a section of options, sizes.elbo.NAME=VALUE, which null cannot"),
