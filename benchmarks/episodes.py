@@ -122,13 +122,14 @@ PUSHT = {
     "coverage": ("env=pusht", "env.criterion=coverage", "env.maximum_steps=60"),
 }
 BOTH = ("75 ahead", "25 ahead")
+RANDOM = {**{task: PUSHT[task] for task in BOTH}, "maze": ("env=maze",)}
 DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "coverage": "planner.horizon=15"}
 SEARCH = ("planner.samples=2048", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
 ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
-CASCADE = (*SEARCH, *ICEM, "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+TRAINED = ("planner.add=[perturbed_rollouts]", "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+CASCADE = (*SEARCH, *ICEM, *TRAINED)
 ACTIONS = ("planner=mpc", "planner.additions=[]")
-FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE)
-ROBUST = ("planner.add=[perturbed_rollouts]",)
+FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE, "planner.add=[]")
 
 
 def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> list[Row]:
@@ -137,18 +138,17 @@ def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> lis
 
 MAZE = ("env=maze", "planner.horizon=60", "checkpoint=runs/maze-{}/checkpoint.safetensors")
 WORLDS = [
-    *pusht("cascade", *CASCADE, *ROBUST, tasks=BOTH),
-    *pusht("cascade, no perturbed rollouts", *CASCADE),
-    *pusht("cascade, N(0, I)", *CASCADE, *ROBUST, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
+    *pusht("cascade", *CASCADE, tasks=BOTH),
+    *pusht("cascade, no perturbed rollouts", *CASCADE, "planner.add=[]"),
+    *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
     *pusht("flat: actions", *FLAT, tasks=BOTH),
     *pusht("flat: actions, 8,192 samples", *FLAT, "planner.samples=8192"),
-    *(Row("random actions", task, None, (*PUSHT[task], "planner=random")) for task in BOTH),
+    *(Row("random actions", task, None, (*chosen, "planner=random")) for task, chosen in RANDOM.items()),
     Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
     Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
-    Row("random actions", "maze", None, ("env=maze", "planner=random")),
-    *pusht("cascade, 512 samples", *CASCADE, *ROBUST, "planner.samples=512"),
-    *pusht("cascade, shooting", *SEARCH, *ROBUST, "planner.optimizer=shooting", CASCADE[-1]),
-    *pusht("cascade, gym-pusht's criterion", *CASCADE, *ROBUST, tasks=["coverage"]),
+    *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
+    *pusht("cascade, shooting", *SEARCH, *TRAINED, "planner.optimizer=shooting"),
+    *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
 ]
 TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
