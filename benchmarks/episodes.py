@@ -19,6 +19,7 @@ import torch
 from records import RESULTS, Record, commit, read, write
 
 from cavin_pyro.config.composition import compose
+from cavin_pyro.config.recipes import WORLDS as RECIPES
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.launching.workers import run_jobs
@@ -124,10 +125,8 @@ PUSHT = {
 BOTH = ("75 ahead", "25 ahead")
 RANDOM = {**{task: PUSHT[task] for task in BOTH}, "maze": ("env=maze",)}
 DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "coverage": "planner.horizon=15"}
-SEARCH = ("planner.samples=2048", "planner.reward_at=subgoals", "planner.shrinking_horizon=true")
-ICEM = ("planner.optimizer=icem", "planner.optimizer.iterations=10", "planner.optimizer.elite_fraction=0.03")
-TRAINED = ("planner.add=[perturbed_rollouts]", "checkpoint=runs/pusht-{}/checkpoint.safetensors")
-CASCADE = (*SEARCH, *ICEM, *TRAINED)
+CASCADE = (*RECIPES["pusht"].plan.split(), "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+SHOOTING = (*(option for option in CASCADE if "optimizer" not in option), "planner.optimizer=shooting")
 ACTIONS = ("planner=mpc", "planner.additions=[]")
 FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE, "planner.add=[]")
 
@@ -147,7 +146,7 @@ WORLDS = [
     Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
     Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
     *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
-    *pusht("cascade, shooting", *SEARCH, *TRAINED, "planner.optimizer=shooting"),
+    *pusht("cascade, shooting", *SHOOTING),
     *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
 ]
 TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
