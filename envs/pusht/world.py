@@ -283,7 +283,9 @@ class PushT(World):
         """Put disc and block (5 or 7 numbers) into a fresh space; whatever is set, it has the same past."""
         simulator = self._simulator
         if not ((state[:4] >= -SIZE) & (state[:4] <= 2 * SIZE)).all():
-            raise ValueError(f"a state must lie in the window, from 0 to {SIZE:g} pixels, not {state.tolist()}")
+            raise ValueError(
+                f"places must be from {-SIZE:g} to {2 * SIZE:g} pixels, as observed, not {state[:4].tolist()}"
+            )
         simulator.reset(seed=0, options={"reset_to_state": [50.0, 50.0, 256.0, 256.0, 0.0]})
         agent, block = simulator.agent, simulator.block
         numbers = state.tolist()

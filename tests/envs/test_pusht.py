@@ -129,6 +129,11 @@ def test_the_outline_is_the_block_of_the_simulator() -> None:
         (lambda: PushT(maximum_steps=0), "^maximum_steps must be a whole number of at least 1, not 0$"),
         (lambda: PushT().reset(options={"goal": [1.0, 2.0]}), "^goal must be 5 finite numbers, not "),
         (lambda: PushT().reset(options={"state": [np.nan] * 5}), "^state must be 5 or 7 finite numbers, not "),
+        (
+            lambda: PushT().reset(options={"state": [1e9] * 5}),
+            "^places must be from -512 to 1024 pixels, as observed, ",
+        ),
+        (lambda: PushT().move_goals(np.zeros((0, 3))), r"^the goal of the T must be 3 finite numbers, not \[\]$"),
     ],
 )
 def test_bad_input_gets_its_one_line(call, message: str) -> None:

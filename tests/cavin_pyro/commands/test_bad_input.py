@@ -28,11 +28,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("plan", "planner.samples=0", "planner.samples=0: samples must be a whole number of at least 1, not 0"),
     ("plan", "planner.horizon=10", "planner.horizon=10: horizon=10 is not divisible by the model's segment length T=3"),
     ("plan", "planner.drop=3", "planner.drop=3: drop must be of type Sequence[str], not 3"),
-    (
-        "plan",
-        "planner.optimizer=cem planner.motion_share=0.001",
-        "4 iterations need at least as many samples (see motion_share), not 1",
-    ),
+    ("plan", "planner.optimizer=cem planner.motion_share=0.001", "need at least as many samples (see motion_"),
     ("plan", "planner.samples=64 pushes_per_plan=9", "error: pushes_per_plan must be "),
     ("check", "sizes.elbo=null", "sizes.elbo is a section of options, sizes.elbo.NAME=VALUE, which null cannot"),
     ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
