@@ -48,6 +48,12 @@ def check_kinds(given: Mapping[str, Any], hints: Mapping[str, Any], error: type[
             raise error(f"{name} must be of type {wanted}, not {told(given[name])}")
 
 
+def check_last(name: str, value: Any, size: int) -> None:
+    """Raise ValueError unless a value is a tensor `[..., size]`."""
+    if (shape := getattr(value, "shape", ()))[-1:] != (size,):
+        raise ValueError(f"{name} must be a tensor [..., {size}], not {[*shape] or told(value)}")
+
+
 def told(value: Any) -> str:
     """A value in an error's line: what has no short text is told by its class."""
     if isinstance(value, type):

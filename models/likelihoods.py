@@ -10,10 +10,9 @@ from typing import Any, TypeVar, get_type_hints
 import torch
 from pyro import distributions
 from pyro.distributions import TorchDistribution, constraints
-from torch import Tensor, nn
+from torch import Tensor
 
 from cavin_pyro.models.checks import check_kinds, check_number
-from cavin_pyro.models.part import Part
 from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State
 
@@ -77,8 +76,14 @@ class LikelihoodScales(Scales):
 
     def __post_init__(self) -> None:
         check_kinds(vars(self), get_type_hints(type(self)))
-        for name, value in _filled(self.space, self.center, self.feature, self.action).items():
-            object.__setattr__(self, name, value)
+        space, parts = self.space, tuple(self.space.action_scales if self.action is None else self.action)
+        object.__setattr__(self, "action", parts)
+        if len(parts) != len(space.action_sizes):
+            raise ValueError(f"scales.action needs {len(space.action_sizes)} numbers, not {len(parts)}")
+        for name, usual in (("center", space.center_scale), ("feature", space.feature_scale)):
+            object.__setattr__(self, name, usual if getattr(self, name) is None else getattr(self, name))
+        for name, value in (("center", self.center), ("feature", self.feature), *[("action", part) for part in parts]):
+            check_number(f"scales.{name}", value, 1e-12, 1e12)  # beyond, its square or a density overflows
 
 
 @dataclass(frozen=True)
@@ -100,45 +105,6 @@ class PredictedScales(LikelihoodScales):
         if predicted is None:
             return super()._around(mean, scale, predicted)
         return IsotropicStudentT(self.degrees_of_freedom, mean, predicted, self.height_ratio if of_centers else None)
-
-
-class LearnedScales(Scales, Part):
-    """Learned standard deviations, shared by f and h, and by all windows. For their units see `Scales`."""
-
-    def __init__(
-        self,
-        space: Space,
-        *,
-        center: float | None = None,
-        feature: float | None = None,
-        action: Sequence[float] | None = None,
-    ) -> None:
-        """Initial values; None takes the space's. Raises `ValueError` for one that is not positive."""
-        super().__init__()
-        self.space = space
-        initial = _filled(space, center, feature, action)
-        parts = zip(space.action_names, initial.pop("action"), strict=True)
-        for name, value in (*initial.items(), *parts):
-            self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(value).log()))
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "action":
-            return [self.get_parameter(f"log_{part}").exp() for part in self.space.action_names]
-        if name in ("center", "feature"):
-            return self.get_parameter(f"log_{name}").exp()
-        return super().__getattr__(name)
-
-
-def _filled(space: Space, center: Any, feature: Any, action: Any) -> dict[str, Any]:
-    """The standard deviations by name, those of the space where one is None."""
-    center = space.center_scale if center is None else center
-    feature = space.feature_scale if feature is None else feature
-    parts = tuple(space.action_scales if action is None else action)
-    if len(parts) != len(space.action_sizes):
-        raise ValueError(f"scales.action needs {len(space.action_sizes)} numbers, not {len(parts)}")
-    for name, value in (("center", center), ("feature", feature), *[("action", part) for part in parts]):
-        check_number(f"scales.{name}", value, 1e-12, 1e12)  # beyond, its square or a density overflows
-    return {"center": center, "feature": feature, "action": parts}
 
 
 class Isotropic(TorchDistribution):

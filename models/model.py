@@ -14,7 +14,7 @@ from pyro.distributions import TorchDistribution
 from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 
-from cavin_pyro.models.checks import told, typed
+from cavin_pyro.models.checks import check_last, told, typed
 from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales, Scales
 from cavin_pyro.models.networks.dynamics import Dynamics, Outcome
 from cavin_pyro.models.networks.layers import StateEncoder, fixed_shapes
@@ -145,6 +145,8 @@ class Model(Program):
 
     def next_state(self, state: State, action: Tensor) -> State:
         """Mean of f: `state: [...]`, `action: [..., A]` -> the state after one action."""
+        self.space.check(state, self.feature_dimension)
+        check_last("action", action, self.space.actions)
         return self.dynamics(state, self.encoder(state) if self.dynamics.reads_encoding else None, action)
 
     @typed(ValueError)

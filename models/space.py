@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import get_type_hints
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from cavin_pyro.models.checks import check_kinds, check_number
+from cavin_pyro.models.checks import check_kinds, check_last, check_number
 from cavin_pyro.models.state import State
 
 
@@ -40,6 +40,8 @@ class Space:
         turning: networks see positions from object 0, and all vectors in its axes: its feature begins with the cosine
             and the sine of its angle. The first two numbers of positions, features and each part of actions turn.
         frequencies: of sines and cosines of positions that networks also read, of wavelengths 2, 1, 1/2 ... lengths.
+        mirror: [P] signs of positions from the origin, and of the parts of actions likewise, under which the world is
+            the same, as (1, -1, 1) in a plane; empty: none. mirror_features: [F] of features, if no geometry tells.
 
     Raises ValueError: a number out of range, or parts of different number.
     """
@@ -57,10 +59,12 @@ class Space:
     unit_features: int | None = None
     turning: bool = False
     frequencies: int = 0
+    mirror: Sequence[float] = field(default=(), compare=False)
+    mirror_features: Sequence[float] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         check_kinds(vars(self), get_type_hints(type(self)))
-        for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales"):
+        for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales", "mirror"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         parts = (self.action_names, self.action_limits, self.action_scales)
         if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in (*parts, {*self.action_names})):
@@ -100,6 +104,11 @@ class Space:
         """How many numbers networks read of a position (`describe`)."""
         seen = self.positions * (1 + 2 * self.frequencies)
         return seen + self.positions if self.turning else seen
+
+    def check(self, state: State, features: int) -> None:
+        """Raise ValueError unless a state has positions of P numbers, and features of so many."""
+        check_last("centers of a state", getattr(state, "centers", state), self.positions)
+        check_last("features of a state", state.features, features)
 
     def project(self, features: Tensor) -> Tensor:
         """Features `[..., F]` as observed ones are: the first `unit_features` numbers of unit length."""

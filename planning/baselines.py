@@ -264,7 +264,7 @@ class PolicyPlanner:
 
         Raises ValueError unless there are scenes, with a generator for each, and for what `act` cannot do.
         """
-        check_scenes(state, generators, steps_left)
+        check_scenes(state, generators, steps_left, observed)
         actions = self.act(state, reward, generators, observed)
         environments, objects, positions = state.centers.shape
         empty = state.centers.new_empty

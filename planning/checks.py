@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -43,7 +44,12 @@ def check_horizon(horizon: int, segment_length: int) -> None:
 
 
 @typed(ValueError)
-def check_scenes(state: State, generators: Sequence[torch.Generator], steps_left: int | None = None) -> None:
+def check_scenes(
+    state: State,
+    generators: Sequence[torch.Generator],
+    steps_left: int | None = None,
+    observed: tuple[Any, ...] | None = None,
+) -> None:
     """Raise ValueError unless `state` is a batch `[B]`, each finite and with an object and a generator of its own."""
     centers = state.centers
     check_number("steps_left", 1 if steps_left is None else steps_left, 1, whole=True)

@@ -120,7 +120,7 @@ class SearchingPlanner(ABC):
         Raises ValueError: a state that is not a batch of at least one scene, another number of generators than B, or an
         environment without a finite candidate, which is named.
         """
-        check_scenes(state, generators, steps_left)
+        check_scenes(state, generators, steps_left, observed)
         size, plans, reward = ENVIRONMENTS_ON_PROCESSOR, [], as_reward(reward)
         if state.centers.device.type != "cpu":
             size = max(1, PLANS_ON_ACCELERATOR // self.samples)

@@ -73,8 +73,7 @@ def assess_intervals(context: CheckContext, *, windows: int = 400, samples: int 
             f"What 90 % intervals cover: good if every 95 % interval over episodes lies within {GOOD[0]:.0%} to "
             f"{GOOD[1]:.0%}, bad if one lies outside of {BAD[0]:.0%} to {BAD[1]:.1%}. Decided by: "
             f"{'; '.join(texts[name] for name, one in levels.items() if one == level)}.",
-            "Train with scales=predicted or scales=learned, or set scales.center, "
-            "scales.feature and scales.action to the RMS errors.",
+            "Train with scales=predicted, or set scales.center, scales.feature and scales.action to the RMS errors.",
             episodes,
         ),
         [

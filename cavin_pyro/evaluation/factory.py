@@ -212,6 +212,9 @@ def _additions(options: dict[str, Any], *, one_push: bool) -> list[Addition]:
     given = {name: options.pop(name, None) or [] for name in kinds}
     given = {name: [one] if isinstance(one, str) else one for name, one in given.items()}
     check_kinds(given, kinds)
+    for option, entries in given.items():
+        if len({str(entry) for entry in entries}) < len(entries):
+            raise UserError(f"planner.{option}: one of {', '.join(map(str, entries))} is given twice")
     for name in itertools.chain(*given.values()):
         if isinstance(name, str):
             check_choice("addition", name, ADDITIONS)

@@ -17,7 +17,7 @@ from cavin_pyro.config.errors import UserError, refused, user_input
 from cavin_pyro.config.options import MAXIMUM_SEED
 from cavin_pyro.envs.randomness import planner_seed
 from cavin_pyro.envs.world import ACTION_DECIMALS, NoRoomError, World, advance, begin, check_goal, observed_state
-from cavin_pyro.models.checks import check_number, typed
+from cavin_pyro.models.checks import check_number, told, typed
 from cavin_pyro.planning import Plan, Planner
 from cavin_pyro.planning.checks import NoFiniteCandidateError, OptimizerError, UnsuitedError
 from cavin_pyro.planning.records import apply
@@ -212,7 +212,7 @@ def rollout(
             plan = planner.plan(state, reward=goal, generators=[generator], observed=shown, steps_left=left)
             if not isinstance(plan, Plan):
                 raise UserError(f"{type(planner).__name__}.plan must return a Plan, not {type(plan).__name__}")
-            shape = list(plan.actions.shape)
+            shape = [*plan.actions.shape] if isinstance(plan.actions, torch.Tensor) else told(plan.actions)
             if len(shape) != 3 or shape[::2] != [1, env.space.actions] or not plan.actions.isfinite().all():
                 wanted = f"actions [1, T, {env.space.actions}], all finite"
                 raise UserError(f"{type(planner).__name__}.plan must return {wanted}, not {shape}")

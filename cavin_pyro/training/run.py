@@ -56,7 +56,7 @@ def train(config: DictConfig) -> Trainer:
         geometry, origin = chosen_geometry(config) if made is None else (None, {})
         started = start_from(config, model, guide, geometry) if config.initial else {}
         train_only(config.trained, model, guide)
-        _mirror_signs(config.trainer.reflect, geometry, guide)
+        _mirror_signs(config.trainer.reflect, model, geometry, guide)
         check_same_run(folder, config, ignore=free(config.trainer.schedule))
         most = max(slots_of(read_metadata(one)) for one in data)
         check_fit(model, geometry, most, features=made["features"] if made else None)
@@ -122,7 +122,7 @@ def fit(
         _check_parts(model, guide, windows, geometry)
         objective = as_objective(Trace_ELBO(max_plate_nesting=1) if objective is None else objective)
         objective.check(model, guide)
-    signs = _mirror_signs(options.reflect, geometry, guide)
+    signs = _mirror_signs(options.reflect, model, geometry, guide)
     stored: Any = dict(config or {})
     if "model" not in stored and output is not None:
         parts = describe(model=model, guide=guide, geometry=geometry)
@@ -178,12 +178,10 @@ def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geo
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
     model.check_priors()
     one = windows.batch(windows.training[:1])
-    given = [one.states.centers.shape[-1], one.states.features.shape[-1], one.actions.shape[-1]]
-    wanted = [model.space.positions, model.feature_dimension, model.space.actions]
-    if given != wanted or windows.objects > model.maximum_objects:
-        sizes = "positions, features and actions of {}, {} and {} numbers and {} objects"
-        have, take = sizes.format(*given, windows.objects), sizes.format(*wanted, f"up to {model.maximum_objects}")
-        raise ValueError(f"the windows have {have}, and the model takes {take}: build it for them")
+    model.space.check(one.states, model.feature_dimension)
+    check_last("actions of the windows", one.actions, model.space.actions)
+    if windows.objects > (most := model.maximum_objects):
+        raise ValueError(f"the windows have {windows.objects} objects, and the model takes {most}: build it for them")
 
 
 def _announce(model: Model, guide: Guide, windows: WindowTable, batch_size: int, seed: int, where: str) -> None:
@@ -246,6 +244,10 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
     Returns its digest and provenance, for that of the new one.
     """
     checkpoint = load(config.initial)
+    if checkpoint.model.space != model.space:
+        raise UserError(
+            f"checkpoint {checkpoint.path} is of another world than the data: their dimensions or units differ"
+        )
     checkpoint.load_into("model", model)
     checkpoint.load_into("guide", guide)
     theirs, ours = (one and geometry_fingerprint(one) for one in (checkpoint.geometry, geometry))
@@ -265,15 +267,15 @@ def train_only(names: Sequence[str], model: Model, guide: Guide) -> None:
         part.requires_grad_(not names or name in names)
 
 
-def _mirror_signs(reflect: bool, geometry: Geometry | None, guide: Guide) -> Tensor | None:
-    signs = geometry.mirror_signs() if reflect and geometry is not None else None
-    if reflect and signs is None:
-        raise UserError(
-            f"trainer.reflect needs geometric features whose mirror image is known, and those of "
-            f"{type(geometry).__name__ if geometry else 'these data'} have none: "
-            f"{'pass geometry=outline, or ' if geometry else ''}leave trainer.reflect"
-        )
-    if reflect and not guide.amortized:
+def _mirror_signs(reflect: bool, model: Model, geometry: Geometry | None, guide: Guide) -> Tensor | None:
+    if not reflect:
+        return None
+    space = model.space
+    signs = geometry.mirror_signs() if geometry else torch.tensor([*space.mirror_features])
+    if signs is None or not (len(signs) and space.mirror):
+        place = f"{type(geometry).__name__} has none: pass geometry=outline" if geometry else "these data have none"
+        raise UserError(f"trainer.reflect needs a mirror image, and {place}, or leave trainer.reflect")
+    if not guide.amortized:
         raise UserError(f"trainer.reflect needs a guide that infers any window, and {type(guide).__name__} does not")
     return signs
 

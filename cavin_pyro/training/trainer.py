@@ -27,6 +27,7 @@ from cavin_pyro.config.parts import PARTS
 from cavin_pyro.data.windows import WindowTable
 from cavin_pyro.guides.guide import Guide
 from cavin_pyro.models.model import Model
+from cavin_pyro.models.space import Space
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.storage.files import atomic_write
 from cavin_pyro.storage.progress import progress_bar
@@ -69,7 +70,7 @@ class Trainer:
         seed: int = 0,
         mirror_signs: Tensor | None = None,
     ) -> None:
-        """`mirror_signs: [F]`, of geometric features: with them every other window is mirrored, at random."""
+        """`mirror_signs: [F]`, of features: with them every other window is mirrored, at random."""
         self.model, self.guide, self.windows = model, guide, windows
         self._programs = nn.ModuleDict({"model": model, "guide": guide})
         self.config = config = config or TrainerConfig()
@@ -132,7 +133,7 @@ class Trainer:
         window = self.windows.batch(indices)
         if self._mirror_signs is not None:
             mirrored = torch.rand(len(indices), generator=self._batches) < 0.5
-            window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs)
+            window = reflect(window, send(mirrored, self.windows.device), self._mirror_signs, self.model.space)
         return window
 
     def _loss_and_gradients(self, window: Window) -> float:
@@ -245,17 +246,16 @@ class Trainer:
             restore_random_states(tensors, self.windows.device, self._seed + self.step)
 
 
-def reflect(window: Window, which: Tensor, signs: Tensor) -> Window:
-    """Mirror some of the windows `[B]` in the plane y = 0, for worlds that are symmetric about it.
+def reflect(window: Window, which: Tensor, signs: Tensor, space: Space) -> Window:
+    """Mirror some of the windows `[B]` as the space says that its world may be.
 
-    `which`: `[B]` bool. `signs`: `[F]`, of features, see `Geometry.mirror_signs`.
+    `which`: `[B]` bool. `signs`: `[F]`, of features.
     """
-    flip = 1.0 - 2.0 * which.to(window.actions.dtype)[:, None]  # [B, 1]
-    same = torch.ones_like(flip)
-    centers = window.states.centers * torch.cat((same, flip, same), 1)[:, None, None]
-    features = torch.where(which[:, None, None, None], window.states.features * signs, window.states.features)
-    actions = window.actions * torch.cat((same, flip, same, flip), 1)[:, None]
-    return window._replace(states=State(centers, features, window.states.mask), actions=actions)
+    states, signs_of = window.states, window.actions.new_tensor(space.mirror)
+    mirror, signs = (torch.where(which[:, None, None, None], one, 1.0) for one in (signs_of, signs))
+    centers = states.centers * mirror + (1.0 - mirror) * mirror.new_tensor(space.origin)
+    actions = window.actions * torch.cat([mirror[:, 0, :, :size] for size in space.action_sizes], -1)
+    return window._replace(states=State(centers, states.features * signs, states.mask), actions=actions)
 
 
 def fixed_windows(windows: WindowTable, count: int, seed: int) -> Tensor:

@@ -113,6 +113,8 @@ class PushT(World):
         unit_features=2,
         turning=True,
         frequencies=4,
+        mirror=(-1.0, 1.0),  # of the T too
+        mirror_features=(1.0, -1.0),
     )
     features, objects, names = 2, 2, ["T", ""]
 

@@ -28,6 +28,7 @@ from cavin_pyro.envs.tabletop.sensors import DepthImage, DepthSensor, sensor_of
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
 from cavin_pyro.envs.tabletop.workspace import OBJECT_SLOTS, push_endpoints
 from cavin_pyro.envs.world import NoRoomError, finite_numbers
+from cavin_pyro.models.checks import told
 
 MOVED = 0.005  # metres; smaller moves do not count
 TURNED = 0.1  # radians
@@ -202,7 +203,11 @@ class Scene(Uncopied):
 
     def capture(self) -> DepthImage:
         """Take a depth image without updating the observation's clouds; `true_masks` then refers to this image."""
-        image, self._body_image = self.sensor.capture(self.world.render)
+        taken = self.sensor.capture(self.world.render)
+        if not isinstance(taken, tuple) or [isinstance(one, DepthImage) for one in taken] != [True, False]:
+            wanted = "capture must return a DepthImage and body numbers"
+            raise ValueError(f"{type(self.sensor).__name__}.{wanted}, not {told(taken)}")
+        image, self._body_image = taken
         depth, bodies = np.asarray(image.depth), np.asarray(self._body_image)
         if depth.dtype.kind != "f" or bodies.dtype.kind != "i" or depth.ndim != 2 or depth.shape != bodies.shape:
             given = f"{depth.dtype} {[*depth.shape]} and {bodies.dtype} {[*bodies.shape]}"

@@ -35,6 +35,7 @@ SPACE = Space(  # the loss weights of the published implementation, divided by t
     center_scale=0.01,
     feature_scale=0.1,  # of a vector of unit length
     action_scales=(0.077, 0.245),
+    mirror=(1.0, -1.0, 1.0),
 )
 """What networks must know of the table; lengths in metres."""
 

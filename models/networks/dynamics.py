@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cavin_pyro.models.checks import check_last
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.networks.layers import ObjectPool, fully_connected
 from cavin_pyro.models.part import Part
@@ -131,6 +132,7 @@ class MetaDynamics(nn.Module):
         self, space: Space, *, effect_dimension: int = 16, feature_dimension: int = 64, width: int = 64
     ) -> None:
         super().__init__()
+        self.effect_dimension = effect_dimension
         self.trunk = EffectTrunk(effect_dimension, width=width, encoder_width=width)
         self.change = StateChange(
             space, maximum_displacement=space.subgoal_range, feature_dimension=feature_dimension, width=width
@@ -138,6 +140,7 @@ class MetaDynamics(nn.Module):
 
     def effect(self, encoded: Tensor, effect_code: Tensor) -> Tensor:
         """Effect feature of (s, c): `[..., M, width]`. The action generator reads it too."""
+        check_last("effect_code", effect_code, self.effect_dimension)
         return self.trunk(encoded, effect_code)
 
     def forward(self, state: State, effect: Tensor) -> State:
@@ -173,13 +176,12 @@ class ActionGenerator(nn.Module):
     def forward(self, effect: Tensor, state: State, motion_code: Tensor | None = None) -> Tensor:
         """`effect: [..., M, width]` of (s, c), `state: [...]`, `motion_code: [..., D]` -> `[..., T, A]`.
 
-        Leading dimensions broadcast. Raises `ValueError` if a motion code is missing.
+        Leading dimensions broadcast. Raises `ValueError` for a motion code of another length, or none.
         """
         feature = self.pool(effect, state.mask)
         if self.transform is not None:
-            if motion_code is None:
-                raise ValueError("these actions depend on a motion code; none was given")
             mean, scale = self.transform(feature).chunk(2, -1)
+            check_last("motion_code", motion_code, mean.shape[-1])
             # Softplus is ten times slower on tensors that are not contiguous.
             feature = mean + functional.softplus(scale.contiguous()) * motion_code
         parts = [

@@ -112,13 +112,9 @@ class StateEncoder(nn.Module):
     def forward(self, state: State) -> Tensor:
         """`state: [...]` of `M` objects -> `[..., M, 3 * width]`.
 
-        Raises `ValueError` for features of another length.
+        Raises `ValueError` for features or centres of another length.
         """
-        if state.features.shape[-1] != self.feature_dimension:
-            raise ValueError(
-                f"features have {state.features.shape[-1]} numbers per object; "
-                f"this model expects {self.feature_dimension}"
-            )
+        self.space.check(state, self.feature_dimension)
         positions = self.space.locate(state)
         spatial = self.spatial(self.space.describe(state, positions))
         # The layer is linear in the difference: W p_j - (W p_i - b) takes M products instead of M squared.

@@ -8,6 +8,7 @@ import torch
 from pyro.distributions import TorchDistribution
 from torch import Tensor, nn
 
+from cavin_pyro.models.checks import check_last
 from cavin_pyro.models.networks.layers import fully_connected
 from cavin_pyro.models.part import Part
 from cavin_pyro.models.space import Space
@@ -52,19 +53,20 @@ class SceneContext(nn.Module):
     def forward(self, state: State, effect_code: Tensor | None) -> Tensor:
         """`state: [...]`, `effect_code: [..., C]` -> `[..., width]`; leading dimensions broadcast.
 
-        Raises `ValueError` for a missing or an unexpected effect code.
+        Raises `ValueError` for a state or an effect code of other dimensions.
         """
         return self.parts(state, effect_code)[1]
 
     def parts(self, state: State, effect_code: Tensor | None) -> tuple[Tensor, Tensor]:
         """Features of each object `[..., M, width]`, zero for padding, and of the scene `[..., width]`."""
+        self.space.check(state, self.from_object.in_features - self.space.inputs)
         place = self.space.describe(state, self.space.locate(state))
         hidden = self.from_object(torch.cat((place, state.features), -1))
-        if self.from_code is not None and effect_code is not None:
+        if self.from_code is not None:
+            check_last("effect_code of this p(z | s, c)", effect_code, self.from_code.in_features)
             hidden = hidden + self.from_code(effect_code).unsqueeze(-2)
-        elif self.from_code is not None or effect_code is not None:
-            wanted = "takes no effect code" if effect_code is not None else "needs the effect code"
-            raise ValueError(f"this prior {wanted}: effect_dimension says whether it is p(z | s, c) or p(c | s)")
+        elif effect_code is not None:
+            raise ValueError("this prior takes no effect code, as it was made without an effect_dimension")
         objects = self.objects(hidden.relu_()) * state.mask.unsqueeze(-1)
         return objects, self.scene(objects.sum(-2))
 

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from cavin_pyro.envs.pusht import CENTER, OUTLINE, PushT, PushTPolicy, in_window
+from cavin_pyro.models.state import State, Window
+from cavin_pyro.training.trainer import reflect
 
 pusht = pytest.importorskip("gym_pusht.envs.pusht", reason="gym-pusht comes with the extras test and pusht")
 
@@ -74,6 +77,21 @@ def test_replayed_actions_reach_the_state_that_was_recorded() -> None:
     observed, _ = env.reset(options={"state": states[2], "goal": states[12, :5]})
     assert not env.goal().success(env.state(observed))
     assert any(env.step(action)[2] for action in actions[2:])
+
+
+def test_a_mirrored_window_is_what_follows_from_the_mirrored_start() -> None:
+    env, space = PushT(criterion="none"), PushT.space
+    states, actions = recorded(env, 5, 6)
+    each = [env.state({"agent": one[:2], "block": one[2:5]}) for one in states]
+    seen = State(*(torch.stack(field)[None] for field in zip(*each, strict=True)))
+    window = Window(seen, torch.tensor(np.array([actions]), dtype=torch.float32), seen.mask, seen.mask)
+    mirrored = reflect(window, torch.tensor([True]), torch.tensor(space.mirror_features), space).states
+    env.reset(options={"state": states[0, :5] * [-1, 1, -1, 1, -1] + [512, 0, 512, 0, 0]})
+    for number, action in enumerate(actions, 1):
+        found = env.state(env.step(action * [-1, 1])[0])
+        torch.testing.assert_close(mirrored.centers[0, number], found.centers, atol=1e-3, rtol=0)
+        torch.testing.assert_close(mirrored.features[0, number], found.features, atol=1e-5, rtol=0)
+    assert not np.array_equal(states[0, 2:5], states[-1, 2:5])
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from cavin_pyro.envs.tabletop.workspace import SPACE
 from cavin_pyro.models.cascaded import CascadedModel
 from cavin_pyro.models.dynamics_only import DynamicsModel
 from cavin_pyro.models.flat import FlatModel
-from cavin_pyro.models.likelihoods import LearnedScales, LikelihoodScales, PredictedScales
+from cavin_pyro.models.likelihoods import LikelihoodScales, PredictedScales
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.contact.dynamics import ContactDynamics
 from cavin_pyro.models.networks.outline import Outline
@@ -50,6 +50,23 @@ def values_of(generated: poutine.Trace) -> dict[str, Tensor]:
     """Of every sampled site, and those of f for all pushes at once."""
     values = {name: generated.nodes[name]["value"] for name in generated.stochastic_nodes}
     return values | {name: torch.stack([values[f"{name}_{push}"] for push in (1, 2, 3)], 1) for name in TRANSITIONS}
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda m, s, c, z, a: m.next_state(s, a[..., 1:]), r"action must be a tensor \[..., 4\], not \[4, 3\]"),
+        (lambda m, s, c, z, a: m.next_state(None, a), r"centers of a state must be a tensor .*, not None"),
+        (lambda m, s, c, z, a: m.subgoal(s, c[..., 1:]), "effect_code must be a tensor"),
+        (lambda m, s, c, z, a: m.actions(s, c, None), "motion_code must be a tensor .*, not None"),
+        (lambda m, s, c, z, a: m.subgoal(s._replace(centers=s.centers[..., 1:]), c), "centers of a state must"),
+    ],
+)
+def test_a_tensor_of_another_size_is_named(call: Callable[..., Any], said: str, random_state: Callable) -> None:
+    model, given = CascadedModel(**SIZES), (random_state(4), torch.zeros(4, 16), torch.zeros(4, 16), torch.zeros(4, 4))
+    model.next_state(given[0], given[3])
+    with pytest.raises(ValueError, match=said):
+        call(model, *given)
 
 
 def test_the_readme_shows_the_sites_of_the_program_in_their_order() -> None:
@@ -204,11 +221,13 @@ def test_scales_and_priors_are_parts_like_any_other(random_window: Callable[...,
         def forward(self, state: State, effect_code: Tensor | None = None) -> Any:
             return distributions.Normal(super().forward(state, effect_code).mean + 9, 1.0).to_event(1)
 
-    model = CascadedModel(scales=LearnedScales(SPACE), effect_prior=Shifted(dimension=16), **SIZES)
+    scales = LikelihoodScales(SPACE)
+    object.__setattr__(scales, "center", torch.tensor(0.01, requires_grad=True))  # as a class of one's own may learn it
+    model = CascadedModel(scales=scales, effect_prior=Shifted(dimension=16), **SIZES)
     traced = trace(model, random_window())
     assert traced.nodes["effect_code"]["value"].mean() > 7 > traced.nodes["motion_code"]["value"].mean()
     traced.log_prob_sum().backward()
-    assert all(one.grad.abs() > 0 for one in model.scales.parameters())
+    assert scales.center.grad.abs() > 0
 
 
 def contact_model(scales: LikelihoodScales) -> tuple[CascadedModel, Window]:

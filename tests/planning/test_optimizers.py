@@ -122,12 +122,8 @@ def test_what_is_no_optimizer_is_refused_in_one_line() -> None:
         make_optimizer("best", samples=SAMPLES)
     with pytest.raises(ValueError, match=rf"^optimizer must be one of {choices}, or an object with a method optimize"):
         make_optimizer(3, samples=SAMPLES)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("name", ["cem", "icem", "mppi"])
-def test_fewer_samples_than_iterations_are_refused(name: str) -> None:
     with pytest.raises(ValueError, match="^4 iterations need at least as many samples .*, not 3$"):
-        make_optimizer(name, samples=3)
+        make_optimizer("mppi", samples=3)
 
 
 @pytest.mark.parametrize("segments", [1, 2, 5])

@@ -223,7 +223,7 @@ def bound_loss(*options: str) -> Loss:
     [
         (),
         CONTACT,
-        ("model=single_latent", "guide=single_latent", "scales=learned"),
+        ("model=single_latent", "guide=single_latent"),
         ("model=flat", "guide=flat", "prior=conditional"),
         ("model=dynamics", "guide=none"),
     ],

@@ -79,8 +79,9 @@ def test_parts_that_are_not_trained_stay_bit_for_bit(folder: Path) -> None:
         (["dynamics=contact"], "ContactDynamics reads the features of Outline, not of PointNet"),
         ([*CONTACT, "trained=[wheels]"], "trained has 'wheels', which is no part of this model: choose from encoder, "),
         ([*CONTACT, "initial={first}", "model.width=16"], "is of another architecture: model."),
+        (["initial=pusht"], "is of another world than the data"),
         (["initial=nothing"], "unknown checkpoint 'nothing': choose from cavin"),
-        (["trainer.reflect=true"], "those of PointNet have none: pass geometry=outline, or leave trainer.reflect"),
+        (["trainer.reflect=true"], "PointNet has none: pass geometry=outline, or leave trainer.reflect"),
         (["geometry=outline", "trainer.reflect=true", "guide=auto_normal"], "trainer.reflect needs a guide that"),
         (["guide=auto_normal", "objective=mean_field_elbo"], "samples auxiliary sites, which this objective leaves"),
     ],
@@ -145,7 +146,7 @@ def test_a_mirrored_window_is_what_mirrored_clouds_give_and_others_stay() -> Non
     clouds = 0.05 * torch.randn(4, 2, 3, 64, 3, generator=generator) + torch.rand(4, 1, 3, 1, 3, generator=generator)
     which = torch.tensor([True, False, True, False])
     recorded = window_of(clouds, geometry)
-    found = reflect(recorded, which, geometry.mirror_signs())
+    found = reflect(recorded, which, geometry.mirror_signs(), SPACE)
     expected = window_of(torch.where(which[:, None, None, None, None], clouds * MIRROR, clouds), geometry)
     torch.testing.assert_close(found.states.centers, expected.states.centers)
     torch.testing.assert_close(found.states.features, expected.states.features, atol=1e-5, rtol=0)

@@ -105,12 +105,6 @@ def test_a_title_tells_the_step_and_what_f_moves_farthest(world: PushingEnv) -> 
     assert f"push 1 of 6: the {world.names[0]} " in drawing.title(world, record(made_up_plan()), 6)
 
 
-def test_a_picture_leaves_out_the_white_above_all_else() -> None:
-    picture = np.full((5, 4, 3), 255, np.uint8)
-    picture[3:] = 0
-    assert drawing.empty_rows(picture) == 3
-
-
 def push(step: int, *, along_x: float = 0.0) -> Transition:
     """After which the target is seen `along_x` metres from where it was, and nothing else has moved."""
     centers = seen_centers()
