@@ -59,7 +59,7 @@ class Row:
     def overrides(self, seed: int) -> list[str]:
         """The options of `evaluate` for the scene of that seed."""
         if self.objects is None:
-            return [option.format(seed % TRAININGS) for option in self.options]
+            return [option.replace("{}", str(seed % TRAININGS)) for option in self.options]
         return [f"task={self.task}", f"objects={self.objects}", "reward=sparse", *self.options]
 
 
@@ -138,14 +138,14 @@ def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> lis
 MAZE = ("env=maze", "planner.horizon=60", "checkpoint=runs/maze-{}/checkpoint.safetensors")
 WORLDS = [
     *pusht("cascade", *CASCADE, tasks=BOTH),
-    *pusht("cascade, no perturbed rollouts", *CASCADE, "planner.add=[]"),
+    *pusht("cascade, no other effects", *CASCADE, "planner.add=[perturbed_rollouts]"),
+    *pusht("cascade, no perturbed rollouts", *CASCADE, "planner.drop=[perturbed_rollouts]"),
     *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
     *pusht("flat: actions", *FLAT, tasks=BOTH),
     *pusht("flat: actions, 8,192 samples", *FLAT, "planner.samples=8192"),
     *(Row("random actions", task, None, (*chosen, "planner=random")) for task, chosen in RANDOM.items()),
     Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
     Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
-    *pusht("cascade, 512 samples", *CASCADE, "planner.samples=512"),
     *pusht("cascade, shooting", *SHOOTING),
     *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
 ]

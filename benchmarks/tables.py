@@ -222,20 +222,20 @@ def _errors(values: Sequence[float]) -> str:
 
 
 def worlds() -> str:
-    """Success in other worlds, that of each training, and against the first row in the same pairs of start and goal."""
+    """Success in other worlds, that of each training, and in the same pairs against the row that it is a variant of."""
     rows = read("worlds")
     tasks, lines = list(groups(rows, "task")), []
     for (name,), found in groups(rows, "row").items():
-        line: list[object] = [name]
+        line, whole = list[object]([name]), name.partition(", ")[0]
         for task in tasks:
             cell = groups(found, "task").get(task, [])
             by_training = sorted(groups(cell, "checkpoint").items())
             shares = [
                 f"{100 * statistics.mean(row['outcome'] == 'success' for row in some):.0f}" for _, some in by_training
             ]
-            first = groups(rows, "row", "task").get((rows[0]["row"], *task), [])
+            first = groups(rows, "row", "task").get((whole if whole != name else rows[0]["row"], *task), [])
             alone, others, p = paired(cell, first)
-            test = f"; {alone}, {others} (p = {p:.2g})" if cell and first and name != rows[0]["row"] else ""
+            test = f"; {alone}, {others} (p = {p:.2g})" if alone or others else ""
             line += [len(cell) or "", f"{rate(cell)}; {', '.join(shares)}{test}" if cell else ""]
         lines.append(line)
     return markdown(["", *(text for (task,) in tasks for text in ("pairs", task))], lines)

@@ -11,8 +11,6 @@ def main(config: DictConfig) -> None:
     import pyro
 
     from cavin_pyro.config.errors import user_input
-    from cavin_pyro.config.parts import check_sizes
-    from cavin_pyro.criticism.export import check_export, write_samples
     from cavin_pyro.criticism.loading import load_context
     from cavin_pyro.criticism.report import write_report
     from cavin_pyro.criticism.sections import choose_sections, fingerprint_of, print_findings, run_sections
@@ -23,18 +21,12 @@ def main(config: DictConfig) -> None:
     pyro.settings.set(module_local_params=True, validate_distributions_pyro=False, validate_distributions_torch=False)
     with user_input("sections", "sizes"):
         names = choose_sections(config.sections, config.sizes)
-        export = check_export(config.export)
-        check_sizes("sizes.export", config.sizes.export)
     with output_folder(config.output) as folder:
-        check_same_run(folder, config, ignore=("output", "sections", "export"))
+        check_same_run(folder, config, ignore=("output", "sections"))
         context, about = load_context(config)
         if "subgoals" in names:
             check_objects(context.model, config.sizes.subgoals.objects)
         write_config(folder, config)
-        if export:
-            sizes = config.sizes.export
-            write_samples(context, export, about, windows=sizes.windows, samples=sizes.samples)
-            print(f"written: {export}")
         # A section of an earlier run is reused if a new run would give the same result.
         parts = run_sections(names, context, config.sizes, folder, fingerprint_of(about))
         write_report(folder, about, parts)

@@ -131,7 +131,8 @@ class SearchingPlanner(ABC):
             chunk = slice(start, start + size)
             seen = observed and records.apply(observed, itemgetter(chunk))
             try:
-                plans.append(self.plan_scene(Query(state.scene(chunk), reward, generators[chunk], seen, segments)))
+                scene = Query(state.scene(chunk), reward, generators[chunk], seen, segments)
+                plans.append(self.added("replan", self.plan_scene(scene), scene, self.plan_scene))
             except NoFiniteCandidateError as error:
                 raise NoFiniteCandidateError(start + error.environment, error.what) from error
         return plans[0] if len(plans) == 1 else records.join(plans, dimension=0)

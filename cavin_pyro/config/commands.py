@@ -200,7 +200,6 @@ class CheckConfig:
     seed: int = seed_option()
     windows: int = option(1000, "held-out windows, and as many training windows", minimum=1)
     sections: list[str] | None = option(None, "sections of the report; by default all", choices=SECTIONS)
-    export: str | None = option(None, "file.nc for samples of prior, guide and predictions, which ArviZ reads")
     sizes: Any = None
     env: WorldConfig = field(default_factory=collection_world)
     world: Any = None

@@ -49,11 +49,11 @@ WORLDS = {
     "pusht": Recipe(
         collect="env.criterion=none steps=60",
         train="dynamics=residual prior.width=64 prior.transforms=6 model.width=128 guide.width=128 "
-        f"model.effect_dimension=8 model.motion_dimension=8 {FLOW}",
+        f"model.effect_dimension=8 model.motion_dimension=8 trainer.reflect=true {FLOW}",
         plan="planner.horizon=15 planner.shrinking_horizon=true planner.reward_at=subgoals planner.samples=2048 "
         "planner.optimizer=icem planner.optimizer.iterations=10 planner.optimizer.elite_fraction=0.03 "
-        "planner.add=[perturbed_rollouts]",
-        sizes=((100_000, 300_000), (4_000, 9_000)),
+        "planner.add=[perturbed_rollouts,{_target_:cavin_pyro.planning.additions.AnotherEffect,tolerance:6}]",
+        sizes=((300_000, 900_000), (4_000, 9_000)),
     ),
     "maze": Recipe(
         collect="steps=100",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import pyro
 import torch
 from pyro import poutine
@@ -20,18 +18,11 @@ Codes = dict[str, Tensor]
 
 
 @torch.no_grad()
-def log_weights(
-    model: Program, guide: Program, window: Window, particles: int, *, fixed: Mapping[str, Tensor] | None = None
-) -> Tensor:
-    """Logarithms of p(observed, codes) / q(codes) for K samples of the codes of each window `[B]`, in nats.
-
-    `fixed`: values of codes `[K, B, D]` that are not sampled. Their densities stay in the weight. Returns `[K, B]`,
-    float64.
-    """
+def log_weights(model: Program, guide: Program, window: Window, particles: int) -> Tensor:
+    """Logarithms of p(observed, codes) / q(codes) for K samples of each window `[B]`: `[K, B]` float64, in nats."""
     pieces = []
     for some in batches(particles, window):
-        here = {name: value[some] for name, value in (fixed or {}).items()}
-        terms = window_terms(model, guide, window, particles=some.stop - some.start, fixed=here)
+        terms = window_terms(model, guide, window, particles=some.stop - some.start)
         pieces.append(-torch.stack([term.double() for term in terms.values()]).sum(0))
     return torch.cat(pieces)
 

@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 
 from cavin_pyro.evaluation.rollout import OUTCOMES
 
+UNIT = " in the world's unit, metres on the tabletop"
 RESAMPLES = 10_000  # of a bootstrap
 
 Rate = dict[str, float]
@@ -78,10 +79,10 @@ def table(results: dict[str, Any], title: str) -> str:
         rate = results[name]
         lines.append(f"{name:16}{100 * rate['rate']:7.1f} %  {100 * rate['low']:5.1f} to {100 * rate['high']:5.1f} %")
     lines.append(f"{'':16}{'mean':>8} {'median':>9} {'95th':>9}")
-    for name, unit in (("steps", ""), ("return", ""), ("planning_ms", " ms"), ("subgoal_distance", " m")):
+    for name, unit in (("steps", ""), ("return", ""), ("planning_ms", " ms"), ("subgoal_distance", UNIT)):
         values = results[name]
         if values is not None:
-            digits = 3 if unit == " m" else 1
+            digits = 3 if unit == UNIT else 1
             row = " ".join(f"{values[key]:9.{digits}f}" for key in ("mean", "median", "p95"))
             lines.append(f"{name:16}{row[1:]}{unit}")
     return "\n".join(lines)

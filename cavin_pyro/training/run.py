@@ -24,7 +24,7 @@ from cavin_pyro.data.dataset import content_record, read_metadata, slots_of
 from cavin_pyro.data.features import geometry_fingerprint
 from cavin_pyro.data.windows import WindowTable, load_windows, shared_space
 from cavin_pyro.guides.guide import Guide
-from cavin_pyro.models.checks import check_number, typed
+from cavin_pyro.models.checks import check_last, check_number, typed
 from cavin_pyro.models.model import Model
 from cavin_pyro.models.networks.geometry import Geometry
 from cavin_pyro.models.space import Space

@@ -182,6 +182,7 @@ class ActionGenerator(nn.Module):
         if self.transform is not None:
             mean, scale = self.transform(feature).chunk(2, -1)
             check_last("motion_code", motion_code, mean.shape[-1])
+            assert motion_code is not None
             # Softplus is ten times slower on tensors that are not contiguous.
             feature = mean + functional.softplus(scale.contiguous()) * motion_code
         parts = [

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from cavin_pyro.models.checks import check_choice
 from cavin_pyro.planning.additions.addition import HOOKS, Addition, Choice, ChosenEffect
+from cavin_pyro.planning.additions.another_effect import AnotherEffect
 from cavin_pyro.planning.additions.early_stopping import EarlyStopping
 from cavin_pyro.planning.additions.failure_avoidance import FailureAvoidance
 from cavin_pyro.planning.additions.first_push import FirstPush
@@ -18,6 +19,7 @@ __all__ = [
     "ADDITIONS",
     "OURS",
     "Addition",
+    "AnotherEffect",
     "Choice",
     "ChosenEffect",
     "EarlyStopping",
@@ -38,9 +40,10 @@ ADDITIONS: dict[str, type[Addition]] = {  # in the order in which they act
     "failure_avoidance": FailureAvoidance,
     "touchdown": Touchdown,
     "perturbed_rollouts": PerturbedRollouts,
+    "another_effect": AnotherEffect,
 }
 
-OURS = tuple(name for name in ADDITIONS if name != "guidance")  # those of `planner=cavin`
+OURS = tuple(name for name in ADDITIONS if name not in ("guidance", "another_effect"))  # those of `planner=cavin`
 
 
 def make_additions(additions: Sequence[str | Addition], hooks: Sequence[str]) -> tuple[Addition, ...]:

@@ -1,4 +1,4 @@
-"""The interface of additions to Algorithm 1: four hooks and three flags, all of which change nothing by default."""
+"""The interface of additions to Algorithm 1: five hooks and three flags, all of which change nothing by default."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from cavin_pyro.models.state import State
 from cavin_pyro.planning.focus import Focus
-from cavin_pyro.planning.protocol import Query, SearchObjective
+from cavin_pyro.planning.protocol import Plan, Query, SearchObjective
 from cavin_pyro.planning.returns import SubgoalDistance
 from cavin_pyro.planning.rollout import Candidates
 
@@ -60,5 +60,9 @@ class Addition:
         """Scores `[B, N]`, of which the highest is chosen; -inf leaves a candidate out (line 10)."""
         return scores
 
+    def replan(self, plan: Plan, scene: Query, again: Callable[[Query], Plan]) -> Plan:
+        """A plan `[B]` in place of the one that was made, such as one of others that `again` makes for scenes."""
+        return plan
 
-HOOKS = ("focus", "wrap_objective", "subgoal_distance", "rank")
+
+HOOKS = ("focus", "wrap_objective", "subgoal_distance", "rank", "replan")

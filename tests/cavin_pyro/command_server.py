@@ -35,7 +35,6 @@ from cavin_pyro.config.composition import compose
 
 IMPORTED = (  # what the commands import when they are run; not the commands themselves, which are run anew
     "cavin_pyro.config.help",
-    "cavin_pyro.criticism.export",
     "cavin_pyro.criticism.loading",
     "cavin_pyro.criticism.report",
     "cavin_pyro.criticism.sections",

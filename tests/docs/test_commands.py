@@ -41,7 +41,6 @@ NOT_RUN = {  # a part of a command, and why it does not run here
     "viewer=live": "runs until Ctrl-C; tests/cavin_pyro/visualization runs it",
     "maze": "needs an extra; tests/envs runs it",
     "cavin_pyro.quickstart": "takes minutes; tests/cavin_pyro/commands runs it",
-    "export=": "needs an extra; tests/cavin_pyro/criticism runs it",
     "cavin_pyro.data export": "needs an extra; tests/cavin_pyro/data runs it",
     "cavin_pyro.data import": "needs an extra; tests/cavin_pyro/data runs it",
     "reproduce scale=": "trains for minutes; tests/cavin_pyro/reproduction runs it on tiny models",
