@@ -124,11 +124,6 @@ def test_compatible_combinations_learn(names: tuple[str, str, str, str], windows
     assert learns(composed(*names), windows, tmp_path)
 
 
-@pytest.mark.parametrize("model", MODELS)
-def test_learned_scales_learn_with_every_model(model: str, windows: WindowTable, tmp_path: Path) -> None:
-    assert learns(composed(model, min(FITTING[model]), scales="learned"), windows, tmp_path)
-
-
 def test_incompatible_combinations_are_refused_in_one_line() -> None:
     invalid = [("cascaded", "flat"), ("flat", "joint"), ("single_latent", "none"), ("dynamics", "cascaded")]
     invalid += [("dynamics", "none", "flow"), ("dynamics", "none", "standard", "iwae")]
