@@ -38,6 +38,7 @@ def finite_numbers(name: str, values: Any, *lengths: int) -> NDArray[np.float64]
 
 def known_options(options: Mapping[str, Any] | None, *names: str, of: str = "reset") -> Mapping[str, Any]:
     """The options of a reset or the like, `{}` for None; a ValueError if one has another name."""
+    check_kinds({f"options of {of}": options}, {f"options of {of}": Mapping[str, Any] | None})
     if unknown := sorted(set(options or {}) - set(names), key=str):
         raise ValueError(f"unknown option {unknown[0]!r} of {of}: choose from {', '.join(names)}")
     return options or {}
@@ -228,6 +229,7 @@ def check_world(world: World) -> None:
     Raises ValueError: its actions, a state or its goal have another shape than the world declares, or other numbers.
     """
     name, space = type(world).__name__, world.space
+    check_kinds({f"{name}: space": space}, {f"{name}: space": Space})
     box = world.action_space
     if not isinstance(box, gymnasium.spaces.Box) or box.shape != (space.actions,):
         raise ValueError(f"{name}: its space has {space.actions} numbers in an action, and its action_space is {box}")
@@ -269,9 +271,13 @@ def advance(world: World, action: NDArray[Any]) -> tuple[Any, Any, bool, bool, d
 
 
 def observed_state(world: World, observation: Any) -> State:
-    """The state of an observation; raises ValueError for something else."""
-    state = world.state(observation)
-    check_kinds({f"{type(world).__name__}: state": state}, {f"{type(world).__name__}: state": State})
+    """The state of an observation; raises ValueError for something else, or another shape than the world declares."""
+    state, name, M = world.state(observation), type(world).__name__, world.objects
+    check_kinds({f"{name}: state": state}, {f"{name}: state": State})
+    shapes = [(M, world.space.positions), (M, world.features), (M,)]
+    if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
+        found = [list(field.shape) for field in state]
+        raise ValueError(f"{name}: a state must have centers, features and mask (bool) of {shapes}, not {found}")
     return state
 
 
@@ -294,11 +300,7 @@ def check_goal(world: World, goal: Any, state: State) -> None:
 
 
 def _check_state(world: World, state: State) -> None:
-    name, space, M = type(world).__name__, world.space, world.objects
-    shapes = [(M, space.positions), (M, world.features), (M,)]
-    if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
-        found = [list(field.shape) for field in state]
-        raise ValueError(f"{name}: a state must have centers, features and mask (bool) of {shapes}, not {found}")
+    name, space = type(world).__name__, world.space
     if not state.mask.any():
         raise ValueError(f"{name}: a state must have an object, and its mask has none")
     for part, values in (("centers", state.centers), ("features", state.features)):

@@ -8,6 +8,7 @@ import pyro
 from pyro.distributions import TorchDistribution
 from torch import Tensor
 
+from cavin_pyro.models.checks import check_last
 from cavin_pyro.models.model import Model, sequence_mask, windows_plate
 from cavin_pyro.models.networks.dynamics import ActionGenerator, MetaDynamics
 from cavin_pyro.models.priors.prior import Prior
@@ -88,10 +89,13 @@ class CascadedModel(Model):
 
     def effect_prior(self, state: State) -> TorchDistribution:
         """p(c | s): `state: [...]` -> batch `[...]`, event `[C]`."""
+        self.space.check(state, self.feature_dimension)
         return self.prior_of_effects(state)
 
     def motion_prior(self, state: State, effect_code: Tensor) -> TorchDistribution:
         """p(z | s, c): `state: [...]`, `effect_code: [..., C]` -> batch `[...]`, event `[Z]`."""
+        self.space.check(state, self.feature_dimension)
+        check_last("effect_code", effect_code, self.effect_dimension)
         return self.prior_of_motions(state, effect_code)
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:

@@ -62,6 +62,7 @@ class FlatModel(Model):
 
     def motion_prior(self, state: State, effect_code: Tensor | None = None) -> TorchDistribution:
         """p(z | s): `state: [...]` -> batch `[...]`, event `[Z]`; the effect code is ignored."""
+        self.space.check(state, self.feature_dimension)
         return self.prior_of_motions(state)
 
     def actions(self, state: State, effect_code: Tensor | None = None, *, motion_code: Tensor) -> Tensor:

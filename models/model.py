@@ -134,8 +134,11 @@ class Model(Program):
             if not hasattr(self, name):  # which planners need, not trainings
                 continue
             effect = [one(1, getattr(self, "effect_dimension", 0))] if code == "motion_code" else []
-            with torch.no_grad(), torch.random.fork_rng(devices=[]):
-                made = getattr(self, name)(state, *effect)
+            try:
+                with torch.no_grad(), torch.random.fork_rng(devices=[]):
+                    made = getattr(self, name)(state, *effect)
+            except Exception as error:
+                raise ValueError(f"{name} takes no state: {str(error).splitlines()[0]}") from error
             wanted = [1, getattr(self, code.replace("code", "dimension"))]
             known = isinstance(made, TorchDistributionMixin)
             if not known or [*made.batch_shape, *made.event_shape] != wanted:
@@ -159,8 +162,11 @@ class Model(Program):
         """
         if self._encoding is not None and self._encoding[0] is window:
             return self._encoding[1]
-        if len(window.batch_shape) != 1:
-            raise ValueError(f"windows come as one batch [B]; got leading dimensions {[*window.batch_shape]}")
+        shape, steps = [*window.batch_shape], window.states.mask.shape[:-1]
+        if len(shape) != 1 or shape == [0] or len(steps) != 2:
+            raise ValueError(f"windows come as one batch [B] with states [B, T + 1], not {shape} with {[*steps]}")
+        self.space.check(window.first, self.feature_dimension)
+        check_last("actions of a window", window.actions, self.space.actions)
         if window.segment_length != self.segment_length:
             raise ValueError(
                 f"window has {window.segment_length} actions; this model was made for {self.segment_length}"

@@ -89,6 +89,7 @@ class SingleLatentModel(Model):
 
     def effect_prior(self, state: State) -> TorchDistribution:
         """p(c | s): `state: [...]` -> batch `[...]`, event `[C]`."""
+        self.space.check(state, self.feature_dimension)
         return self.prior_of_effects(state)
 
     def subgoal(self, state: State, effect_code: Tensor) -> State:

@@ -78,6 +78,10 @@ class Space:
         for name, usual in (("subgoal_range", 3.0 * self.step_range), ("center_scale", self.length / 50)):
             check_number(f"{name} of a space", getattr(self, name))
             object.__setattr__(self, name, getattr(self, name) or usual)
+        if self.subgoal_range < self.step_range:
+            raise ValueError(f"subgoal_range of a space is at least its step_range, not {self.subgoal_range:g}")
+        if {*self.mirror, *self.mirror_features} - {-1, 1} or len(self.mirror) not in (0, self.positions):
+            raise ValueError("mirror [P] and mirror_features [F] of a space are signs, 1 or -1")
         for value in self.origin:
             check_number("origin of a space", value, -1e30, 1e30)
         for value in self.action_sizes:

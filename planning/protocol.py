@@ -136,6 +136,7 @@ class Reparameterized(Protocol):
         """The sample `[..., D]` that `noise: [..., D]` determines."""
 
 
+@runtime_checkable
 class StepOutcome(Protocol):
     """The outcome of one step, in any batch `[...]`. Success and failure both end the episode."""
 

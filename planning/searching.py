@@ -11,7 +11,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from cavin_pyro.models.checks import check_choice, check_number, typed
+from cavin_pyro.models.checks import check_choice, check_number, told, typed
 from cavin_pyro.models.state import State
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions import Addition, make_additions
@@ -80,6 +80,9 @@ class SearchingPlanner(ABC):
         compile: bool | str = False,
     ) -> None:
         """Raises ValueError for numbers out of range, a horizon that T does not divide, unknown names."""
+        if not all(hasattr(model, method) for method in self.requires.methods):
+            needed, lacking = self.requires.model, self.requires.violation(model)
+            raise ValueError(f"{type(self).__name__} needs a model as {needed}; {told(model)} {lacking}")
         check_number("samples", samples, 1, whole=True)
         check_number("decimals", 1 if decimals is None else decimals, 1)
         check_horizon(horizon, model.segment_length)

@@ -39,7 +39,7 @@ OUTPUT = {  # the folder of a run for which the user names none
 # Options that never decide which folder a run has: runs that differ only in these are the same run.
 SAME_RUN = {"output", "workers", "transitions", "sections", "episodes", "video", "video_format", "viewer", "port"}
 USER_CLASS = re.compile(r"\+{0,2}(env\.(?:robot|objects|camera|segmentation))\._target_=")
-PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "export", "models", "table", "env.assets")
+PATHS = ("output", "data", "checkpoint", "pointnet", "initial", "models", "table", "env.assets")
 OF_TABLETOP = ("task", "tiles", "layout", "generated", "reward", "criterion", "objects", "maximum_steps", "margin")
 
 
@@ -143,7 +143,9 @@ def finished(name: str, config: DictConfig, hydra_config: Any, differing: Sequen
             raise UserError(f"{group} must be one of {', '.join(presets(group))}")
     if differing is not None:
         plain["output"] = os.path.join(hydra_config.sweep.dir, _file_name(differing))
-    elif not plain["output"]:
+    elif plain["output"] == "":
+        raise UserError("output= is empty: name a folder, or leave it out")
+    elif plain["output"] is None:
         plain["output"] = _default_output(name, plain, hydra_config)
     return OmegaConf.create(plain)
 
@@ -294,6 +296,8 @@ def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
     if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
         return _unknown(name, key, known)
     first = str(error.__cause__ or error).splitlines()[0]
+    if "ListConfig" in first:
+        return f"{word}: {key} must be a list, such as [a,b]"
     if entry := re.fullmatch("Key '(.+)' is not in struct", first):
         return _unknown(name, f"{key}.{entry[1]}", known)
     if first.startswith("Could not override") and "/" in key:

@@ -17,6 +17,7 @@ from cavin_pyro.config.world import world_of
 from cavin_pyro.data.dataset import Arrays
 from cavin_pyro.envs.randomness import collection_streams
 from cavin_pyro.envs.world import World, advance, begin, observed_state
+from cavin_pyro.models.checks import told
 from cavin_pyro.models.space import Space
 
 
@@ -65,6 +66,8 @@ def collected(world: World, seed: int, number: int, steps: int) -> Arrays:
     """
     scene, choices = collection_streams(seed, number)
     policy, world.maximum_steps = world.policy(choices), steps  # an episode of data is no attempt at a goal
+    if not hasattr(policy, "act"):
+        raise ValueError(f"{type(world).__name__}: policy must give what has a method act, not {told(policy)}")
     observation = begin(world, int(scene.integers(2**32)))
     states, actions, ended = [observed_state(world, observation)], list[Any](), False
     while len(actions) < steps and not ended:

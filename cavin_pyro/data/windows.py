@@ -184,9 +184,9 @@ class WindowTable:
 
         Raises ValueError: there are none, or no windows of these numbers.
         """
-        low, high = torch.as_tensor(indices).aminmax() if len(indices) else (-1, -1)
+        low, high = indices.aminmax() if indices.dtype == torch.int64 and indices.numel() else (-1, -1)
         if not 0 <= int(low) <= int(high) < len(self.starts):
-            raise ValueError(f"a batch needs numbers of windows from 0 to {len(self.starts) - 1}, at least one")
+            raise ValueError(f"a batch needs whole numbers of windows, 0 to {len(self.starts) - 1}, at least one")
         positions = self.starts[indices, None] + self._steps
         objects = int(self._objects[positions].max())
         positions = send(positions, self._actions.device)
@@ -219,6 +219,8 @@ def load_windows(
     Raises UserError: no dataset, a corrupt shard, incompatible datasets, or no window to train on.
     """
     config = config or WindowConfig()
+    if not folders:
+        raise UserError("there are no folders to read: give at least one")
     every = [dataset.read_metadata(folder) for folder in folders]
     space = shared_space(folders)
     if geometry is None and space is None:

@@ -132,6 +132,8 @@ def make_planner(
     Raises:
         UserError: an unknown planner or option, or a model that lacks what the planner needs.
     """
+    if not planner:
+        raise UserError("planner must be a choice of the option, or a section with _target_, not empty")
     given = {f"planner.{name}": value for name, value in options.items()}
     shared = {"pushes_per_plan": pushes_per_plan, "device": device, "seed": seed}
     config = compose("plan", planner=planner, **shared, **given)

@@ -171,8 +171,8 @@ def rollout(
             optimizer, a world or a planner of the user's own raises an error.
         RuntimeError: the robot stands in the camera's view.
     """
-    if not hasattr(planner, "plan"):
-        raise UserError(f"planner must have a method plan, as of make_planner, and {type(planner).__name__} has none")
+    if not hasattr(planner, "plan") or isinstance(planner, type):
+        raise UserError(f"planner must be a Planner, as of make_planner, not {told(planner)}")
     device = choose_device(device) if isinstance(device, str) else device
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)

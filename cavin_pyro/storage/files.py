@@ -16,6 +16,7 @@ from cavin_pyro.config.errors import UserError
 from cavin_pyro.storage.lock import LOCK_NAME, folder_lock
 
 CONFIG_NAME = "config.yaml"  # the options of a run
+DATA_NAME = "data.json"  # which data a training began with
 HELD = {"a run": CONFIG_NAME, "a dataset": "metadata.json"}  # by what a folder for results shows what it holds
 PARTIAL = ".partial"  # in the names of files that are being written
 OURS = ".cavin-"  # in the names of those that `atomic_write` makes, which alone are cleared away
@@ -31,7 +32,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
             os.fsync(written.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        if error.errno is not None and error.filename is None:
+        if error.errno is not None and error.filename in (None, str(temporary)):
             error.filename = str(path)  # the error of a full disk names no file
         raise
     finally:
@@ -86,13 +87,14 @@ def output_folder(path: str | Path, holds: str = "a run") -> Iterator[Path]:
             yield folder
         except BaseException:
             if folder in made and holds_no_result(folder):
-                (folder / CONFIG_NAME).unlink(missing_ok=True)
+                for name in (CONFIG_NAME, DATA_NAME):
+                    (folder / name).unlink(missing_ok=True)
             raise
 
 
 def holds_no_result(folder: Path) -> bool:
     """Whether a run in a folder, if there is one, failed before its first result."""
-    return {one.name for one in folder.iterdir()} <= {CONFIG_NAME, LOCK_NAME}
+    return {one.name for one in folder.iterdir()} <= {CONFIG_NAME, DATA_NAME, LOCK_NAME}
 
 
 def clear_abandoned(folder: Path, *, older_than: float = 0.0) -> None:

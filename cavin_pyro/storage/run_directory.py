@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cavin_pyro.config.errors import UserError, user_input
 from cavin_pyro.config.options import flat_options, shown
-from cavin_pyro.storage.files import CONFIG_NAME, atomic_write, holds_no_result, read_json, write_json
+from cavin_pyro.storage.files import CONFIG_NAME, DATA_NAME, atomic_write, holds_no_result, read_json, write_json
 
 
 def write_config(folder: Path, config: DictConfig) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
 
     `data`: of each dataset, among other things, its number of `transitions` and the `fingerprint` of its content.
     """
-    path = folder / "data.json"
+    path = folder / DATA_NAME
     now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
     if not path.exists():
         write_json(path, now)

@@ -273,7 +273,8 @@ def _mirror_signs(reflect: bool, model: Model, geometry: Geometry | None, guide:
     space = model.space
     signs = geometry.mirror_signs() if geometry else torch.tensor([*space.mirror_features])
     if signs is None or not (len(signs) and space.mirror):
-        lacking = f"{type(geometry).__name__} has none: pass geometry=outline" if geometry else "these data have none"
+        own = type(geometry).__name__ if geometry else ""
+        lacking = f"{own} has none: pass geometry=outline" if own else "the space lacks mirror or mirror_features"
         raise UserError(f"trainer.reflect needs a mirror image; {lacking}, or leave trainer.reflect")
     if not guide.amortized:
         raise UserError(f"trainer.reflect needs a guide that infers any window, and {type(guide).__name__} does not")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavin_pyro.models.checks import check_last
 from cavin_pyro.models.space import Space
 
 TABLE_LOW = (0.22, -0.61)  # metres; the table is 0.76 m by 1.22 m around (0.60, 0.00)
@@ -65,6 +66,7 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
     `action`: [..., 4] (x, y, dx, dy), clipped to [-1, 1]. Returns start: [..., 2] metres; end: [..., 2] metres.
     """
     action = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+    check_last("action", action, 4)
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
     start = low + (action[..., :2] + 1.0) / 2.0 * (high - low)
     end = np.clip(start + MAXIMUM_MOTION * action[..., 2:], low, high)
@@ -74,6 +76,8 @@ def push_endpoints(action: NDArray[np.floating]) -> tuple[NDArray[np.float64], N
 def normalised_push(start: NDArray[np.floating], motion: NDArray[np.floating]) -> NDArray[np.float64]:
     """The action [..., 4] that starts at `start` [..., 2] metres and moves by `motion` [..., 2] metres."""
     low, high = np.array(REACH_LOW), np.array(REACH_HIGH)
+    for name, value in (("start", start), ("motion", motion)):
+        check_last(name, np.asarray(value), 2)
     position = 2.0 * (np.asarray(start, dtype=np.float64) - low) / (high - low) - 1.0
     return np.concatenate([position, np.asarray(motion, dtype=np.float64) / MAXIMUM_MOTION], axis=-1)
 

@@ -94,6 +94,7 @@ def states(*places: float) -> Tensor:
         ({"action_space": gymnasium.spaces.Box(-2.0, 2.0, (1,))}, "must be a box from -1 to 1"),
         ({"features": 2}, r"must have centers, features and mask \(bool\) of .*, not \[\[1, 1\], \[1, 3\], \[1\]\]"),
         ({"objects": 2}, r"must have centers, features and mask"),
+        ({"space": {"origin": 0}}, "space must be of type Space, not"),
         ({"reset": lambda world, **_: (math.nan, {})}, r"centers must be finite float32 numbers, not .*nan"),
         ({"step": lambda world, _: (math.inf, 0.0, False, False, SAID)}, "centers must be finite float32 numbers"),
         ({"step": lambda world, _: (0.0, 0.0, False, False, {})}, "info of a step must have success, and has nothing"),

@@ -59,6 +59,8 @@ def values_of(generated: poutine.Trace) -> dict[str, Tensor]:
         (lambda m, s, c, z, a: m.next_state(None, a), r"centers of a state must be a tensor .*, not None"),
         (lambda m, s, c, z, a: m.subgoal(s, c[..., 1:]), "effect_code must be a tensor"),
         (lambda m, s, c, z, a: m.actions(s, c, None), "motion_code must be a tensor .*, not None"),
+        (lambda m, s, c, z, a: m.motion_prior(s, c[..., 1:]), "effect_code must be a tensor"),
+        (lambda m, s, c, z, a: m.effect_prior(None), "centers of a state must be"),
         (lambda m, s, c, z, a: m.subgoal(s._replace(centers=s.centers[..., 1:]), c), "centers of a state must"),
     ],
 )
@@ -127,8 +129,11 @@ def test_generated_windows_score_the_same_when_observed(random_window: Callable[
 def test_windows_of_another_shape_are_refused(kind: type[Model], random_window: Callable[..., Window]) -> None:
     with pytest.raises(ValueError, match="window has 2 actions; this model was made for 3"):
         kind(**SIZES)(random_window(steps=2))
-    with pytest.raises(ValueError, match=r"one batch \[B\]; got leading dimensions \[1, 4\]"):
-        kind(**SIZES)(random_window().map(lambda tensor: tensor.unsqueeze(0)))
+    for change in (lambda tensor: tensor.unsqueeze(0), lambda tensor: tensor[:0]):
+        with pytest.raises(ValueError, match=r"one batch \[B\] with states \[B, T \+ 1\], not "):
+            kind(**SIZES)(random_window().map(change))
+    with pytest.raises(ValueError, match=r"actions of a window must be a tensor \[..., 4\], not \[4, 3, 2\]"):
+        kind(**SIZES)((window := random_window())._replace(actions=window.actions[..., :2]))
 
 
 @every_model

@@ -94,6 +94,8 @@ def test_projection_scales_the_first_numbers_and_leaves_the_free_ones() -> None:
         ({"frequencies": 10**9}, "whole number of at least 0 and at most 24, not 1000000000"),
         ({"origin": "ab"}, "^origin must be of type Sequence.float., not 'ab'$"),
         ({"turning": True, "action_sizes": (3,)}, "actions in parts of 2"),
+        ({"subgoal_range": 1e-3}, "^subgoal_range of a space is at least its step_range, not 0.001$"),
+        ({"mirror": (2.0, 0.0)}, "of a space are signs, 1 or -1$"),
     ],
 )
 def test_a_space_that_cannot_be_is_one_clear_line(changed: dict[str, Any], said: str) -> None:

@@ -129,7 +129,7 @@ def test_windows_are_of_one_episode_and_most_of_them_move(walks: Path) -> None:
     [
         (["geometry=outline"], "have no point clouds: leave geometry="),
         (["dynamics=contact"], "is for pushes on a table: choose dynamics=paper"),
-        (["trainer.reflect=true"], "these data have none, or leave trainer.reflect"),
+        (["trainer.reflect=true"], "lacks mirror or mirror_features, or leave trainer.reflect"),
         (["windows.minimum_move=0.2"], "^windows.minimum_move is of the tabletop"),
         (["model.feature_dimension=3"], "model.feature_dimension=3, but the world's features have 1"),
     ],

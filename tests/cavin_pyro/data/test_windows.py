@@ -134,8 +134,8 @@ def test_a_batch_holds_what_the_arrays_hold_from_a_file_without_a_name(tmp_path:
             features = pointnet(torch.from_numpy(arrays["clouds"][episode, ahead]).float())
         torch.testing.assert_close(window.states.features[row], features, rtol=0, atol=1e-6)
     assert table.batch(torch.tensor([12])).states.objects == 1  # without padding that no window needs
-    for there_are_none in ([-1], [0, 36], []):
-        with pytest.raises(ValueError, match="^a batch needs numbers of windows from 0 to 35, at least one$"):
+    for there_are_none in ([-1], [0, 36], [], [0.5]):
+        with pytest.raises(ValueError, match="^a batch needs whole numbers of windows, 0 to 35, at least one$"):
             table.batch(torch.tensor(there_are_none))
     bucket = table.sample(64, torch.Generator().manual_seed(0), bucketed=True)
     assert len(set(table.batch(bucket).states.mask.sum(-1).flatten().tolist())) == 1

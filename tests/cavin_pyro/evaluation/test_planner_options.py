@@ -162,9 +162,14 @@ def test_an_episode_from_python_is_that_of_the_command(checkpoints: dict[str, Pa
     runner.env.close(), env.close()
     for model, wrong, said in (
         (None, {}, "needs a model: give cavin_pyro.load"),
+        (trained.model, {"planner": {}}, "a section with _target_, not empty"),
         (trained.model, {"samplez": 3}, "planner.samplez"),
         (trained.model, {"samples": 0}, "samples must be a whole number of at least 1, not 0"),
         (trained.model, {"pushes_per_plan": 99}, "pushes_per_plan must be a whole number .* at most 3, not 99"),
     ):
         with pytest.raises(UserError, match=said):
             cavin_pyro.make_planner(model, **wrong)
+    with pytest.raises(ValueError, match="CavinPlanner needs a model as cascaded; .* has no effect_prior"):
+        CavinPlanner(cavin_pyro.load(checkpoints["flat"]).model)
+    with pytest.raises(UserError, match="planner must be a Planner, as of make_planner, not the class CavinPlanner"):
+        cavin_pyro.rollout(env, CavinPlanner, seed=0)

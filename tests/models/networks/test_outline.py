@@ -77,6 +77,9 @@ def test_features_are_unit_vectors_whatever_the_order_of_the_points() -> None:
     assert features.shape == (2, 3, 64)
     assert torch.allclose(features.norm(dim=-1), torch.ones(2, 3))
     assert torch.allclose(Outline()(clouds[..., torch.randperm(256), :]), features, atol=1e-6)
+    for wrong in (None, clouds[..., :2], clouds[..., :0, :], clouds[:0], clouds / 0):
+        with pytest.raises(ValueError, match="^clouds must "):
+            Outline()(wrong)
 
 
 def test_sizes_survive_the_scaling_to_unit_length() -> None:
