@@ -272,8 +272,9 @@ def advance(world: World, action: NDArray[Any]) -> tuple[Any, Any, bool, bool, d
 
 def observed_state(world: World, observation: Any) -> State:
     """The state of an observation; raises ValueError for something else, or another shape than the world declares."""
-    state, name, M = world.state(observation), type(world).__name__, world.objects
+    state, name = world.state(observation), type(world).__name__
     check_kinds({f"{name}: state": state}, {f"{name}: state": State})
+    M = state.objects if world.sees_clouds else world.objects  # of which a camera may see some later than others
     shapes = [(M, world.space.positions), (M, world.features), (M,)]
     if [tuple(field.shape) for field in state] != shapes or state.mask.dtype != torch.bool:
         found = [list(field.shape) for field in state]

@@ -138,7 +138,8 @@ class Model(Program):
                 with torch.no_grad(), torch.random.fork_rng(devices=[]):
                     made = getattr(self, name)(state, *effect)
             except Exception as error:
-                raise ValueError(f"{name} takes no state: {str(error).splitlines()[0]}") from error
+                said = (str(error).splitlines() or [repr(error)])[0]
+                raise ValueError(f"{name} fails for a scene [1]: {said}") from error
             wanted = [1, getattr(self, code.replace("code", "dimension"))]
             known = isinstance(made, TorchDistributionMixin)
             if not known or [*made.batch_shape, *made.event_shape] != wanted:

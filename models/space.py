@@ -14,6 +14,8 @@ from torch.nn import functional
 from cavin_pyro.models.checks import check_kinds, check_last, check_number
 from cavin_pyro.models.state import State
 
+MIRRORS = ("mirror", "mirror_features")
+
 
 def unit(values: Tensor) -> Tensor:
     """Scale to unit length along the last dimension; zeros stay zeros."""
@@ -64,7 +66,7 @@ class Space:
 
     def __post_init__(self) -> None:
         check_kinds(vars(self), get_type_hints(type(self)))
-        for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales", "mirror"):
+        for name in ("origin", "action_sizes", "action_names", "action_limits", "action_scales", *MIRRORS):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         parts = (self.action_names, self.action_limits, self.action_scales)
         if not self.action_sizes or any(len(one) != len(self.action_sizes) for one in (*parts, {*self.action_names})):
@@ -80,8 +82,10 @@ class Space:
             object.__setattr__(self, name, getattr(self, name) or usual)
         if self.subgoal_range < self.step_range:
             raise ValueError(f"subgoal_range of a space is at least its step_range, not {self.subgoal_range:g}")
-        if {*self.mirror, *self.mirror_features} - {-1, 1} or len(self.mirror) not in (0, self.positions):
-            raise ValueError("mirror [P] and mirror_features [F] of a space are signs, 1 or -1")
+        if self.mirror and (len(self.mirror) != self.positions or max(self.action_sizes) > self.positions):
+            raise ValueError("mirror of a space has P signs, and actions in parts of no more numbers")
+        if {*self.mirror, *self.mirror_features} - {-1, 1}:
+            raise ValueError("mirror and mirror_features of a space are signs, 1 or -1")
         for value in self.origin:
             check_number("origin of a space", value, -1e30, 1e30)
         for value in self.action_sizes:

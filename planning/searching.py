@@ -63,7 +63,7 @@ class SearchingPlanner(ABC):
     """
 
     requires: ClassVar[ModelRequirements]  # of the planner on its model
-    hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank")  # of `Addition`, which the planner calls
+    hooks: ClassVar[tuple[str, ...]] = ("wrap_objective", "rank", "replan")  # of `Addition`, which the planner calls
 
     @typed(ValueError)
     def __init__(

@@ -123,7 +123,9 @@ class TrainerConfig:
     matmul_precision: str = option("float32", PRECISION, choices=PRECISIONS)
     cuda_graphs: bool = option(True, "on a GPU, replay each step's loss and gradients as one CUDA graph")
     clip_norm: float = option(250.0, "largest norm of the gradient of the mean loss per window", positive=True)
-    reflect: bool = option(False, "mirror every other window, at random, where the space and geometry=outline say how")
+    reflect: bool = option(
+        False, "mirror every other window, at random, where the world says how; on the table with geometry=outline"
+    )
     validate_every: int = option(1000, "steps between validations, at which a killed run can resume", minimum=1)
     validation_windows: int = option(4096, "windows per validation, at most", minimum=1)
     patience: int = option(20, "validations without a new best before training stops", minimum=1)

@@ -296,7 +296,7 @@ def _reason(name: str, word: str, error: Exception, known: DictConfig) -> str:
     if "/" not in key and not key.startswith("hydra") and OmegaConf.select(known, key, default=error) is error:
         return _unknown(name, key, known)
     first = str(error.__cause__ or error).splitlines()[0]
-    if "ListConfig" in first:
+    if "ListConfig" in first and OmegaConf.is_list(OmegaConf.select(known, key)):
         return f"{word}: {key} must be a list, such as [a,b]"
     if entry := re.fullmatch("Key '(.+)' is not in struct", first):
         return _unknown(name, f"{key}.{entry[1]}", known)

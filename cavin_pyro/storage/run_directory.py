@@ -54,7 +54,7 @@ def check_same_data(folder: Path, data: Sequence[Mapping[str, Any]]) -> None:
     """
     path = folder / DATA_NAME
     now = [{name: dataset[name] for name in ("transitions", "fingerprint")} for dataset in data]
-    if not path.exists():
+    if not path.exists() or holds_no_result(folder):
         write_json(path, now)
     elif (earlier := read_json(path)) != now:
         raise UserError(

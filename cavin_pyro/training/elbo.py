@@ -20,14 +20,7 @@ Sites = dict[str, Any]  # of a trace: dictionaries of Pyro's, by name
 Program = Callable[..., Any]  # a Pyro program, or one with a handler around it; called with a window
 
 
-def window_terms(
-    model: Program,
-    guide: Program,
-    window: Window,
-    *,
-    particles: int | None = None,
-    fixed: Mapping[str, Tensor] | None = None,
-) -> dict[str, Tensor]:
+def window_terms(model: Program, guide: Program, window: Window, *, particles: int | None = None) -> dict[str, Tensor]:
     """Each term of -ELBO for each window of a batch [B], from one sample of the codes, or from K.
 
     The sum over terms is minus the logarithm of the sample's importance weight. Sites of the model that the guide lacks
@@ -36,15 +29,13 @@ def window_terms(
 
     Args:
         particles: K, an outermost plate of independent samples; the programs must broadcast over it.
-        fixed: values of codes, `[B, D]` or `[K, B, D]`, that replace samples from the guide. Their terms
-            are still the guide's and the model's densities at these values.
 
     Returns `nll_<site>` for observed sites and `kl_<site>` (a one-sample estimate) for codes: `[B]` or `[K, B]`. An
     automatic guide of Pyro's has its density at auxiliary sites, each a term `kl_<site>` more: `[]` if one density is
     that of all windows.
     """
     with pyro.plate("particles", particles, dim=-2) if particles else nullcontext():
-        guided = poutine.trace(substitute(guide, fixed or {})).get_trace(window)
+        guided = poutine.trace(guide).get_trace(window)
         replayed = poutine.enum(poutine.replay(model, trace=guided), first_available_dim=-3 if particles else -2)
         joint = poutine.trace(replayed).get_trace(window)
     guided.compute_log_prob()

@@ -245,9 +245,7 @@ def start_from(config: DictConfig, model: Model, guide: Guide, geometry: Geometr
     """
     checkpoint = load(config.initial)
     if checkpoint.model.space != model.space:
-        raise UserError(
-            f"checkpoint {checkpoint.path} is of another world than the data: their dimensions or units differ"
-        )
+        raise UserError(f"checkpoint {checkpoint.path} is of another world than the data: their spaces differ")
     checkpoint.load_into("model", model)
     checkpoint.load_into("guide", guide)
     theirs, ours = (one and geometry_fingerprint(one) for one in (checkpoint.geometry, geometry))
@@ -273,9 +271,11 @@ def _mirror_signs(reflect: bool, model: Model, geometry: Geometry | None, guide:
     space = model.space
     signs = geometry.mirror_signs() if geometry else torch.tensor([*space.mirror_features])
     if signs is None or not (len(signs) and space.mirror):
-        own = type(geometry).__name__ if geometry else ""
+        own = type(geometry).__name__ if geometry and signs is None else ""
         lacking = f"{own} has none: pass geometry=outline" if own else "the space lacks mirror or mirror_features"
         raise UserError(f"trainer.reflect needs a mirror image; {lacking}, or leave trainer.reflect")
+    with user_input():
+        check_last("mirror_features of the space", signs, model.feature_dimension)
     if not guide.amortized:
         raise UserError(f"trainer.reflect needs a guide that infers any window, and {type(guide).__name__} does not")
     return signs

@@ -19,7 +19,7 @@ class Geometry(Part):
     def __call__(self, clouds: Tensor) -> Tensor:
         """Raises ValueError for what are no clouds."""
         shape = [*getattr(clouds, "shape", ())]
-        if not (isinstance(clouds, Tensor) and len(shape) > 1 and shape[-1] == 3 and shape[-2] and shape[0]):
+        if not (isinstance(clouds, Tensor) and len(shape) > 1 and shape[-1] == 3 and clouds.numel()):
             raise ValueError(f"clouds must be a tensor [..., P, 3] of at least a point, not {shape or told(clouds)}")
         if not clouds.isfinite().all():
             raise ValueError("clouds must have finite numbers: some have not")

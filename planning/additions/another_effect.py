@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import ClassVar
 
 from cavin_pyro.models.checks import check_number
 from cavin_pyro.planning import records
 from cavin_pyro.planning.additions.addition import Addition
+from cavin_pyro.planning.checks import NoFiniteCandidateError
 from cavin_pyro.planning.protocol import Plan, Query
 from cavin_pyro.planning.returns import squared_distance
 
@@ -23,9 +26,11 @@ class AnotherEffect(Addition):
 
     Of all plans it takes one that reaches the goal by h, and of these the one whose segment ends nearest.
 
-    tolerance: in the world's unit, of all positions together, as in line 10; 0.03 are 3 cm on the tabletop.
-    attempts: plans, at most. Raises ValueError for a negative tolerance, and counts below 1.
+    tolerance: in the world's unit, of all positions together, without features; 0.03 are 3 cm on the tabletop.
+    attempts: plans, the first one included. Raises ValueError for a negative tolerance, and counts below 1.
     """
+
+    for_motions: ClassVar[bool] = True
 
     tolerance: float = 0.03
     attempts: int = 4
@@ -48,7 +53,8 @@ class AnotherEffect(Addition):
             for _ in range(self.attempts - 1):
                 if _shortfall(best) <= (False, self.tolerance):
                     break
-                best = min(best, again(alone), key=_shortfall)
+                with suppress(NoFiniteCandidateError):  # of this attempt
+                    best = min(best, again(alone), key=_shortfall)
             taken.append(best)
         return records.join(taken, dimension=0)
 

@@ -24,9 +24,6 @@ def test_terms_of_windows_are_the_same_with_and_without_particles(cascade: Check
     for name, term in found[0].items():
         assert term.shape == (12,)
         torch.testing.assert_close(found[1][name], term.unsqueeze(0))
-    held = {name: torch.zeros(7, 12, 4, dtype=torch.float64) for name in cascade.codes}
-    terms = window_terms(cascade.model, cascade.guide, cascade.training, particles=7, fixed=held)
-    assert all(torch.equal(term, term[:1].expand(7, 12)) for term in terms.values())
 
 
 def test_minus_elbo_is_the_sum_of_the_terms(cascade: CheckContext) -> None:
