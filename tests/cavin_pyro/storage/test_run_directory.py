@@ -71,7 +71,9 @@ def test_a_stored_configuration_of_another_form_is_one_line(stored: str, said: s
 
 def test_training_resumes_with_the_same_data_in_any_folder(tmp_path: Path) -> None:
     data = {"transitions": 60, "fingerprint": "12ab", "episodes": 12}
+    check_same_data(tmp_path, [{**data, "transitions": 1}])  # of a run that kept nothing
     check_same_data(tmp_path, [data])
+    (tmp_path / "metrics.csv").touch()
     check_same_data(tmp_path, [{**data, "episodes": 13}])
     noted = (tmp_path / "data.json").read_text()
     for other in ([{**data, "fingerprint": "34cd"}], [{**data, "transitions": 70}], [data, data]):
