@@ -123,6 +123,13 @@ def test_each_slip_of_a_world_is_refused_in_one_line(members: dict[str, Any], sa
         assert "Error" not in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_a_state_that_changes_its_shape_in_an_episode_is_refused() -> None:
+    twice = State(torch.zeros(2, 1), torch.zeros(2, 3), REAL.repeat(2))
+    changing = of(state=lambda world, place: twice if place else Line().state(place))
+    with pytest.raises(UserError, match="Line: a state must have centers"):
+        rollout(changing(), RandomPlanner(action_dimension=1), seed=0)
+
+
 def test_a_step_earns_its_end_its_time_and_its_progress() -> None:
     outcome = Far(SPACE, weight=2.0).along(states(0.0, 0.5, 0.25, 1.5, -2.0), REAL)
     assert outcome.success.tolist() == [False, False, True, False]
