@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import pyarrow
@@ -23,6 +24,7 @@ from cavin_pyro.config.recipes import WORLDS as RECIPES
 from cavin_pyro.evaluation.evaluation import episode_row
 from cavin_pyro.evaluation.factory import EpisodeRunner, make_runner
 from cavin_pyro.launching.workers import run_jobs
+from cavin_pyro.reproduction.methods import METHODS
 from cavin_pyro.storage.progress import progress_bar
 
 SCHEMA = pyarrow.schema(
@@ -64,7 +66,7 @@ class Row:
 
 
 PAPER = ("planner=paper", "planner.motion_horizon=full_horizon", "checkpoint=cavin")
-PAPERS_WORLD = ("env.robot=sawyer", "env.objects=ycb", "env.camera=kinect2", "env.segmentation=clusters")
+SEEN = ("env.objects=ycb", "env.assets=assets", "env.camera=kinect2", "env.segmentation=clusters")
 TASKS = ("clearing", "insertion", "crossing")
 MADE = "checkpoint=runs/quickstart/pushes-20-{}/train/checkpoint.safetensors"  # by quickstart seed=0, 1 and 2
 
@@ -78,12 +80,22 @@ SUCCESS = [
     *of_each_task("ours, 5 objects", objects=5),
     Row("ours, 10 objects", "crossing", 10, ("planner.horizon=60",)),
     *of_each_task("ours, the paper's networks", "checkpoint=cavin"),
-    *of_each_task("ours, in the paper's world", *PAPERS_WORLD),
+    *of_each_task("ours, in the paper's world", "env.robot=sawyer", *SEEN),
     *of_each_task("Algorithm 1, 3 objects", *PAPER, "env.segmentation=clusters", "criterion=published"),
     *of_each_task("Algorithm 1, 5 objects", *PAPER, objects=5),
     *of_each_task("script without a model, 3 objects", "planner=scripted"),
-    *of_each_task("random pushes", "planner=random"),
     *(row for seed in range(3) for row in of_each_task(f"quickstart, seed {seed}", MADE.format(seed))),
+]
+PLANNERS = {
+    "ours": (),
+    **{one.label: one.planners["paper"] for one in METHODS.values() if one.in_paper},
+    "script": ("planner=scripted",),
+    "heuristic": ("planner=heuristic",),
+}
+LAYOUTS = [
+    row
+    for (name, options), layout in product(PLANNERS.items(), range(3))
+    for row in of_each_task(f"{name}, layout {layout}", f"layout={layout}", "criterion=published", *options)
 ]
 
 
@@ -98,7 +110,6 @@ FARTHER = [
     *(generated("insertion", tiles) for tiles in (5, 7)),
     *(generated("clearing", tiles) for tiles in (6, 9, 14)),
     Row("3 objects", "rearrange", 3, ("planner.horizon=3", "reward=dense")),
-    Row("3 objects", "gathering"),
 ]
 LEFT_OUT = {  # an addition, and the options without it
     "nothing": (),
@@ -109,7 +120,6 @@ LEFT_OUT = {  # an addition, and the options without it
     "touchdown": ("planner.drop=[touchdown]",),
     "plans about the target": ("planner.drop=[nearest_objects]",),
     "first push": ("planner.drop=[first_push]",),
-    "fewer motions": ("planner.motion_share=1",),
 }
 ADDITIONS = [
     Row(name, task, objects, options)
@@ -123,9 +133,9 @@ PUSHT = {
     "coverage": ("env=pusht", "env.criterion=coverage", "env.maximum_steps=60"),
 }
 BOTH = ("75 ahead", "25 ahead")
-RANDOM = {**{task: PUSHT[task] for task in BOTH}, "maze": ("env=maze",)}
 DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "coverage": "planner.horizon=15"}
 CASCADE = (*RECIPES["pusht"].plan.split(), "checkpoint=runs/pusht-{}/checkpoint.safetensors")
+QUICK = "checkpoint=runs/quickstart/pusht-20-{}/train/checkpoint.safetensors"  # by quickstart env=pusht seed=0, 1, 2
 SHOOTING = (*(option for option in CASCADE if "optimizer" not in option), "planner.optimizer=shooting")
 ACTIONS = ("planner=mpc", "planner.additions=[]")
 FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE, "planner.add=[]")
@@ -138,18 +148,20 @@ def pusht(name: str, *options: str, tasks: Sequence[str] = ("75 ahead",)) -> lis
 MAZE = ("env=maze", "planner.horizon=60", "checkpoint=runs/maze-{}/checkpoint.safetensors")
 WORLDS = [
     *pusht("cascade", *CASCADE, tasks=BOTH),
+    *pusht("quickstart", *CASCADE, QUICK, tasks=BOTH),
+    *pusht("quickstart, 8,192 samples", *CASCADE, QUICK, "planner.samples=8192", tasks=BOTH),
     *pusht("cascade, no other effects", *CASCADE, "planner.add=[perturbed_rollouts]"),
-    *pusht("cascade, no perturbed rollouts", *CASCADE, "planner.drop=[perturbed_rollouts]"),
     *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
     *pusht("flat: actions", *FLAT, tasks=BOTH),
     *pusht("flat: actions, 8,192 samples", *FLAT, "planner.samples=8192"),
-    *(Row("random actions", task, None, (*chosen, "planner=random")) for task, chosen in RANDOM.items()),
+    *(Row("random actions", task, None, (*PUSHT[task], "planner=random")) for task in BOTH),
+    Row("random actions", "maze", None, ("env=maze", "planner=random")),
     Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
     Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
     *pusht("cascade, shooting", *SHOOTING),
     *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
 ]
-TABLES = {"success": SUCCESS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
+TABLES = {"success": SUCCESS, "layouts": LAYOUTS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 

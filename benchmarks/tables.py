@@ -26,7 +26,6 @@ TASKS = ("clearing", "insertion", "crossing")
 RULES = ("published", "strict")
 METHODS = {"cavin": "CAVIN", "contact": "CAVIN, contact", "sectar": "SeCTAR", "cvae_mpc": "CVAE-MPC", "mpc": "MPC"}
 WORLDS = "75 ahead", "maze"  # of Push-T, and the other one
-NOTHING = "Not measured yet.\n"
 
 
 def read(name: str) -> list[Row]:
@@ -53,12 +52,6 @@ def rate(rows: Sequence[Row], outcome: str = "outcome") -> str:
         return ""
     found = wilson(sum(row[outcome] == "success" for row in rows), len(rows))
     return f"{100 * found['rate']:.1f} % ({100 * found['low']:.1f} to {100 * found['high']:.1f})"
-
-
-def pushes(rows: Sequence[Row], outcome: str = "outcome", steps: str = "steps") -> str:
-    """Median and mean number of pushes of the successes."""
-    counts = [row[steps] for row in rows if row[outcome] == "success"]
-    return f"{statistics.median(counts):g} ({statistics.mean(counts):.1f})" if counts else ""
 
 
 def seeds(rows: Sequence[Row]) -> str:
@@ -184,18 +177,6 @@ def variants() -> str:
     return markdown(["method", "planner", "episodes", *head], lines)
 
 
-def factors() -> str:
-    """Networks, data and planner in crossing: success by the strict rules, and pushes."""
-    lines = []
-    for (planner, method, data), found in sorted(groups(read("factors"), "planner", "method", "data").items()):
-        cells = []
-        for (_,), rows in sorted(groups(found, "objects").items()):
-            cells += [rate(rows, "strict_outcome"), pushes(rows, "strict_outcome", "strict_steps")]
-        lines.append([f"`{planner}`", f"`{method}`", data, len(found), *cells])
-    head = ["planner", "networks", "pushes in training", "episodes"]
-    return markdown([*head, *(f"{what}, {count} objects" for count in (3, 5) for what in ("success", "pushes"))], lines)
-
-
 def accuracy() -> str:
     """Errors of predicted centres, in centimetres, of objects that moved and that did not."""
     rows = read("accuracy")
@@ -250,12 +231,12 @@ def as_stored(name: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
     "success": success,
+    "layouts": lambda: success("layouts"),
     "farther": lambda: success("farther"),
     "additions": additions,
     "reproduction": reproduction,
     "more_objects": more_objects,
     "variants": variants,
-    "factors": factors,
     "accuracy": accuracy,
     "worlds": worlds,
     "speed": lambda: as_stored("speed"),
@@ -268,7 +249,7 @@ def written(text: str) -> str:
     def table(found: re.Match[str]) -> str:
         name = {"readme": "success", "more_objects": "reproduction", "variants": "reproduction"}.get(found[2], found[2])
         exists = (RESULTS / f"{name}.parquet").exists()
-        return f"{found[1]}\n{TABLES[found[2]]() if exists else NOTHING}\n{found[3]}"
+        return f"{found[1]}\n{TABLES[found[2]]() if exists else 'Not measured yet.'}\n{found[3]}"
 
     return MARKERS.sub(table, text)
 

@@ -23,8 +23,8 @@ def _run() -> None:
     parser.add_argument("--output", type=Path, default=Path("compare.html"), metavar="FILE", help="the page")
     line = parser.parse_args()
     named = {name: runs for name, *runs in line.method}
-    if (not line.runs and not named) or len(named) < len(line.method):
-        parser.error("give at least one RUN, and each --method NAME once")
+    if (not line.runs and not named) or len(named) < len(line.method) or "" in named:
+        parser.error("give at least one RUN, and each --method NAME RUN once, with a name")
     if line.output.suffix != ".html" or not line.output.parent.is_dir():
         parser.error(f"--output {line.output} must be FILE.html, in a folder that is there")
     from cavin_pyro.evaluation.comparison import as_text, compare, write_page

@@ -158,13 +158,14 @@ class SearchProblem:
     def __call__(self, noise: Tensor) -> Tensor:
         """The returns `[B, n]` of the candidates that standard normal `noise: [B, n, K, D]` determines.
 
-        Raises OptimizerError for noise of another shape.
+        Raises OptimizerError for noise of another shape, or with NaN.
         """
         environments, segments, dimension = len(self.generators), self.segments, self.dimension
-        if noise.ndim != 4 or (noise.shape[0], *noise.shape[2:]) != (environments, segments, dimension):
+        fits = noise.ndim == 4 and (noise.shape[0], *noise.shape[2:]) == (environments, segments, dimension)
+        if not fits or noise.isnan().any():
             raise OptimizerError(
                 f"candidates must be noise [B, n, K, D] = [{environments}, n, {segments}, {dimension}], "
-                f"not {list(noise.shape)}"
+                f"not {list(noise.shape)}{' with NaN' if fits else ''}"
             )
         return self.evaluate(noise).returns
 

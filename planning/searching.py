@@ -185,15 +185,17 @@ class SearchingPlanner(ABC):
     def added(self, hook: str, value: Value, *arguments: Any) -> Value:
         """A value after every addition's `hook(value, *arguments)`, in the order in which they act.
 
-        Raises ValueError: an addition returned another kind of value, or another shape.
+        Raises ValueError: an addition returned another kind of value, or another shape, or NaN.
         """
         for addition in self.additions:
             before, value = value, getattr(addition, hook)(value, *arguments)
-            if isinstance(before, Tensor) and getattr(value, "shape", None) != before.shape:
+            if isinstance(before, Tensor):
+                wanted = f"shape {list(before.shape)}"
                 given = f"shape {list(value.shape)}" if isinstance(value, Tensor) else type(value).__name__
-                raise ValueError(
-                    f"{type(addition).__name__}.{hook} must return shape {list(before.shape)}, not {given}"
-                )
+                if isinstance(value, Tensor) and given == wanted and (value.isnan() & ~before.isnan()).any():
+                    given = "NaN"
+                if given != wanted:
+                    raise ValueError(f"{type(addition).__name__}.{hook} must return {wanted}, not {given}")
         return value
 
 

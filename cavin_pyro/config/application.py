@@ -144,6 +144,10 @@ def _line(error: Exception, words: Sequence[str]) -> str | None:
         return f"{', '.join(about)}: {said}" if about else said
     if isinstance(error, OSError) and error.errno in _DISK_ERRORS:
         return _refusal(error)
+    if isinstance(error, FileNotFoundError) and not os.path.isdir(
+        folder := os.path.dirname(str(error.filename)) or "."
+    ):
+        return f"the folder {folder} has disappeared while this command used it: run it again"
     if lacks_memory(error):
         return one_line(error)
     variable = _of_environment(error) if isinstance(error, ValueError) else None
@@ -169,6 +173,7 @@ def _refusal(error: OSError) -> str:
     where = f" at {name}" if name else ""
     if error.errno in _TAKEN:
         return f"something else is{where or ' where results go'} ({error.strerror}): move it away, or choose output=DIR"
+    where = where or " or what is printed"
     return f"the disk refused to store results{where}: {error.strerror}; free some space or choose output=DIR"
 
 

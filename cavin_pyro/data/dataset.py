@@ -310,6 +310,8 @@ def shard_digest(path: Path) -> str:
 
     Raises UserError: the file cannot be read.
     """
+    if path.exists() and not path.is_file():
+        raise UserError(f"shard {path} is no regular file: run its {COLLECT} again")
     try:
         return file_digest(path)
     except OSError as error:

@@ -134,7 +134,11 @@ def _mapped(folder: Path | None, shape: tuple[int, ...], dtype: np.dtype[Any]) -
     """An array in a temporary file, which need not fit in memory; without a name, so that it goes with the process."""
     with tempfile.TemporaryFile(dir=folder) as file:
         # A full disk is an error here; of a mapped file it would be a signal that ends the process.
-        os.posix_fallocate(file.fileno(), 0, max(1, dtype.itemsize * math.prod(shape)))
+        try:
+            os.posix_fallocate(file.fileno(), 0, max(1, dtype.itemsize * math.prod(shape)))
+        except OSError as error:
+            error.filename = str(folder or tempfile.gettempdir())
+            raise
         return np.memmap(file, dtype, mode="r+", shape=shape)
 
 

@@ -50,7 +50,7 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
         source = minari.load_dataset(identity)
     except (OSError, ValueError) as error:
         said = " ".join(str(error).split())
-        raise UserError(f"no dataset minari:{identity} here ({said}): minari download {identity}") from error
+        raise UserError(f"no whole dataset minari:{identity} here ({said}): minari download {identity}") from error
     episodes = []
     with progress_bar("importing", total=int(source.total_episodes), unit="episode") as bar:
         for number, one in enumerate(source.iterate_episodes()):

@@ -103,7 +103,7 @@ def _rows(run: Evaluation, name: str, training: int, options: list[Row]) -> pd.D
     elif isinstance(run, pd.DataFrame):
         found = run
     else:
-        with user_input(where=f"{where} is no evaluation"):
+        with user_input(where=f"{where} is neither a folder nor what evaluate has returned"):
             found = pd.DataFrame(run["per_episode"] if isinstance(run, Mapping) else list(run))
     if "success" not in found and "outcome" in found and found["outcome"].isin(OUTCOMES).all():
         found["success"] = found["outcome"] == "success"

@@ -177,6 +177,7 @@ def rollout(
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
+    seed = int(seed)  # Gymnasium takes no other kind of whole number
     if getattr(getattr(planner, "model", None), "space", env.space) != env.space:
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
     if photograph and env.render_mode is None:

@@ -52,7 +52,9 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise UserError(f"{path} is damaged: it is not JSON ({error})") from error
+        raise UserError(
+            f"{path} is damaged: it is not JSON ({error}); delete it and run what wrote it again"
+        ) from error
 
 
 def file_digest(path: Path) -> str:
@@ -77,16 +79,15 @@ def output_folder(path: str | Path, holds: str = "a run") -> Iterator[Path]:
             held.callback(_delete_empty, made)
             held.enter_context(folder_lock(folder))
             clear_abandoned(folder)
-        except OSError as error:
-            raise UserError(
-                f"output folder {folder} cannot be written ({error.strerror}): choose another with output=DIR"
-            ) from error
+        except (OSError, ValueError) as error:  # the latter of a name with a null byte
+            why = getattr(error, "strerror", error)
+            raise UserError(f"output folder {folder} cannot be written ({why}): choose another output=DIR") from error
         if other := [one for one, name in HELD.items() if one != holds and (folder / name).exists()]:
             raise UserError(f"{folder} holds {other[0]}, not {holds}: choose another output=DIR")
         try:
             yield folder
         except BaseException:
-            if folder in made and holds_no_result(folder):
+            if folder in made and folder.is_dir() and holds_no_result(folder):
                 for name in (CONFIG_NAME, DATA_NAME):
                     (folder / name).unlink(missing_ok=True)
             raise

@@ -176,6 +176,8 @@ def _check_parts(model: Model, guide: Guide, windows: WindowTable, geometry: Geo
             raise ValueError(f"the windows' features are not of this {type(geometry).__name__}: give what made them")
     if guide.model is not model:
         raise ValueError("the guide was built for another model: build one for this model, or give guide.model")
+    if other := {one.dtype for part in (model, guide) for one in part.parameters()} - {torch.float32}:
+        raise ValueError(f"weights must be float32, not {other.pop()}: call float() of model and guide")
     model.check_priors()
     one = windows.batch(windows.training[:1])
     model.space.check(one.states, model.feature_dimension)

@@ -22,7 +22,7 @@ from cavin_pyro.envs.tabletop.objects.sampling import Area, ObjectParameters, Ob
 from cavin_pyro.envs.tabletop.observation import MINIMUM_PIXELS, LatestClouds, Observation
 from cavin_pyro.envs.tabletop.physics import PhysicsWorld, Poses, Uncopied
 from cavin_pyro.envs.tabletop.robots import RobotFactory, robot_factory
-from cavin_pyro.envs.tabletop.robots.robot import TIP_HEIGHT, Stopped, push, settle
+from cavin_pyro.envs.tabletop.robots.robot import TIP_HEIGHT, Robot, Stopped, push, settle
 from cavin_pyro.envs.tabletop.segmentation import Pixels, SegmenterFactory, segmenter_of
 from cavin_pyro.envs.tabletop.sensors import DepthImage, DepthSensor, sensor_of
 from cavin_pyro.envs.tabletop.sensors.camera import Camera
@@ -116,14 +116,15 @@ class Scene(Uncopied):
         `areas`: start area of each object; the first is the target. `generator`: the scene's stream, from which those
         of objects and points derive (`cavin_pyro.envs.randomness`). Raises NoRoomError: no such scene was found.
         """
+        seen = 0
         for _ in range(SCENE_SAMPLES):
             scene_generator, point_generator = generator.spawn(2)
             observation = self.reset(sample_objects(areas, ranges, scene_generator, self.object_set), point_generator)
-            if observation.visible.sum() == len(areas) and not self._any_fallen() and acceptable(observation):
+            seen = int(observation.visible.sum())
+            if seen == len(areas) and not self._any_fallen() and acceptable(observation):
                 return observation
-        raise NoRoomError(
-            f"no room for {len(areas)} objects: none of {SCENE_SAMPLES} scenes sampled on its start tiles is usable"
-        )
+        found = f"none of {SCENE_SAMPLES} scenes on its start tiles is usable, the last with {seen} objects seen"
+        raise NoRoomError(f"no room for {len(areas)} objects: {found}")
 
     def reset(self, objects: Sequence[ObjectParameters], point_generator: np.random.Generator) -> Observation:
         """Build a scene, let it settle, and observe it. Raises ValueError: no object, or more than `slots`."""
@@ -136,6 +137,8 @@ class Scene(Uncopied):
             for one, color in zip(objects, cycle(COLORS), strict=False)
         ]
         self.robot = self._make_robot(self.world)
+        if missing := [name for name in vars(Robot) if name[0] != "_" and not hasattr(self.robot, name)]:
+            raise ValueError(f"robot {type(self.robot).__name__} lacks {', '.join(missing)}")
         settle(self.world, self.robot, self.bodies, limit=720)
         self.sensor.reset(named_stream(point_generator, SENSOR))
         self._latest_clouds = LatestClouds(point_generator, self.slots)
@@ -179,7 +182,16 @@ class Scene(Uncopied):
 
         Raises RuntimeError: the robot stands in the camera's view.
         """
-        return self._observe(self.segmenter.follow)
+        return self._observe(lambda image: self._pixels(image, self.segmenter.follow(image)))
+
+    def _pixels(self, image: DepthImage, found: list[Pixels]) -> list[Pixels]:
+        """What a segmentation found; raises ValueError for pixels that the image has not."""
+        for indices in found:
+            for index, size in zip(indices, image.depth.shape, strict=True):
+                if np.asarray(index).dtype.kind not in "iu" or not ((index >= 0) & (index < size)).all():
+                    wanted = f"rows and columns within {[*image.depth.shape]} for each object"
+                    raise ValueError(f"{type(self.segmenter).__name__} must give {wanted}, not {told(indices)}")
+        return found
 
     def _observe(self, segment: Callable[[DepthImage], list[Pixels]]) -> Observation:
         if not self.robot.clear_of_view(self.sensor.nominal):
@@ -189,7 +201,7 @@ class Scene(Uncopied):
 
     def _find_objects(self, image: DepthImage) -> list[Pixels]:
         """Begin an episode of the segmentation, and order the bodies as it orders the objects, for reports."""
-        found = self.segmenter.start(image, self.point_at_target(image))
+        found = self._pixels(image, self.segmenter.start(image, self.point_at_target(image)))
         named: list[int] = []
         for pixels in found[: len(self.bodies)]:
             body = int(np.bincount(self._body_image[pixels] + 1, minlength=1).argmax()) - 1

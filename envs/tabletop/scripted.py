@@ -1,13 +1,16 @@
-"""A script that pushes towards the goal without a model: the floor for learned planners."""
+"""Policies without a model: the floors for learned planners."""
 
 from __future__ import annotations
 
 import math
+from zlib import crc32
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cavin_pyro.envs.tabletop.observation import ObservedPoints
+from cavin_pyro.envs.tabletop.observation import Observation, ObservedPoints
+from cavin_pyro.envs.tabletop.policy import HeuristicPushingPolicy
 from cavin_pyro.envs.tabletop.robots.robot import STICK_RADIUS
 from cavin_pyro.envs.tabletop.tasks.reward import TaskReward
 from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT, normalised_push
@@ -63,3 +66,17 @@ class ScriptedPush:
         impossible = landing | (pushes.abs() > 1).any(-1)
         cost = left - 10.0 * success + 100.0 * failure + 1000.0 * impossible  # of metres on a table
         return pushes.flatten(0, 2)[cost.argmin()].clamp(-1, 1)[None]
+
+
+class HeuristicPush:
+    """Pushes an object as the policy that collects data, without a goal; what is seen decides which and how."""
+
+    def __call__(self, state: State, reward: TaskReward, observed: ObservedPoints) -> Tensor:
+        """The next normalised push `[1, 4]`; for arguments and errors see `ScriptedPush`."""
+        if not isinstance(observed, ObservedPoints):
+            raise ValueError("planner=heuristic pushes on the tabletop alone: choose another planner here")
+        clouds = observed.points[0].unflatten(0, (-1, POINTS_PER_OBJECT)).numpy()  # [O, 256, 2]
+        centers, seen = state.centers[state.mask].numpy(), np.ones(len(clouds), dtype=np.bool_)
+        observation = Observation(clouds, centers, seen, seen)
+        policy = HeuristicPushingPolicy(np.random.default_rng(crc32(clouds.tobytes())))
+        return torch.from_numpy(policy.act(observation)).float()[None]

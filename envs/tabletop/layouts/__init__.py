@@ -23,6 +23,7 @@ from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
 from cavin_pyro.models.checks import check_choice
 
 RANDOM, GENERATED = "random", "generated"
+MOST = 100_000  # characters of a layout
 _FOLDER = Path(__file__).parent
 
 
@@ -148,7 +149,10 @@ def _path(kind: type[Task], layout: int | str | Path) -> Path:
 
 def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        with open(path, encoding="utf-8") as file:
+            text = file.read(MOST + 1)
+        if len(text) > MOST:
+            raise ValueError(f"it has more than {MOST} characters")
         content, nodes = yaml.safe_load(text), getattr(yaml.compose(text, yaml.SafeLoader), "value", ())
     except OSError as error:
         raise ValueError(f"layout {path} cannot be read ({error.strerror}): give {_choices(kind)}") from error

@@ -110,6 +110,8 @@ def scanned_objects(assets: str | Path | None) -> NamedObjects:
     try:
         manifest = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
         scans = {f"{SCANS}/{name}": _scan(folder, name, values) for name, values in manifest.items()}
+        if not scans:
+            raise ValueError("meta.json lists no object")
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         what = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else f"damaged: {error!r}"
         get = _GET.replace("DIR", str(folder.parent))
@@ -143,6 +145,8 @@ def chosen(names: Sequence[str], objects: ObjectSet) -> tuple[str, ...]:
 
     Raises ValueError: an unknown name; the message lists the valid ones.
     """
+    if not objects.names:
+        raise ValueError(f"{type(objects).__name__} has no objects: its names are empty")
     found = []
     for name in names:
         meant = [one for one in objects.names if name in (one, plain_name(one))]
@@ -174,10 +178,12 @@ def _scan(folder: Path, name: str, values: dict[str, Any]) -> ObjectAsset:
     mass = float(values["mass"])
     lines = collision.read_text(encoding="utf-8").splitlines()
     vertices = np.array([line.split()[1:4] for line in lines if line.startswith("v ")], dtype=np.float64).reshape(-1, 3)
-    visual.stat()
     if plain_name(name) != name or not all(0.0 < number < np.inf for number in (mass, x, y, z)):
         raise ValueError(f"{name} needs a mass and an inertia_diag of three numbers")
     if not (len(vertices) and (np.abs(vertices) < FARTHEST).all()):  # also if one is no number
         raise ValueError(f"the vertices of {collision.name} are no points in metres")
+    parts, faces = (sum(line.startswith(kind) for line in lines) for kind in ("o ", "f "))
+    if not faces or parts != values.get("nparts", parts) or "\nf " not in visual.read_text(encoding="utf-8"):
+        raise ValueError(f"{collision.name} or {visual.name} is cut")
     radius = float(np.linalg.norm(vertices, axis=1).max())
     return ObjectAsset(f"{SCANS}/{name}", mass, radius, collision.absolute(), visual.absolute(), (x, y, z))

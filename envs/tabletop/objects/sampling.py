@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectSet, chosen
+from cavin_pyro.envs.tabletop.objects.object_sets import BUILTIN, ObjectAsset, ObjectSet, chosen
 from cavin_pyro.envs.tabletop.objects.shapes import BUILTIN_NAMES
 from cavin_pyro.envs.tabletop.workspace import TABLE_HIGH, TABLE_LOW
 from cavin_pyro.envs.world import NoRoomError
@@ -122,6 +122,7 @@ def sample_objects(
     for position, orientation in zip(positions, orientations, strict=True):
         choices = names if sampled else targets
         asset = objects.asset(choices[generator.integers(len(choices))])
+        check_kinds({f"{type(objects).__name__}.asset": asset}, {f"{type(objects).__name__}.asset": ObjectAsset})
         scale = generator.uniform(*ranges.scale)
         radius = scale * asset.radius
         # Long neighbours may overlap in the plan view: the later one is then dropped from above the earlier one.

@@ -87,6 +87,8 @@ def test_a_name_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], tm
     assert said.startswith(f"something else is at {tmp_path / 'report.json'} (")
     (tmp_path / "sections").touch()
     assert ended(lambda: (tmp_path / "sections").mkdir(), capsys)[1].startswith(f"something else is at {tmp_path}")
+    said = ended(lambda: write_json(tmp_path / "gone" / "report.json", {}), capsys)[1]
+    assert said.startswith(f"the folder {tmp_path / 'gone'} has disappeared")
 
 
 @pytest.mark.parametrize("ask", [lambda: torch.empty(10**14), lambda: np.zeros(10**15)])

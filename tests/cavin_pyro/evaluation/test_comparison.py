@@ -97,6 +97,7 @@ def test_the_command_compares_and_refuses(shell: SimpleNamespace, tmp_path: Path
         ["a.csv", "b.csv"],
         ["a.csv", "--output", "a.csv"],
         ["--method", "a", "a.csv", "--method", "a", "b.csv"],
+        ["a.csv", "--method", "", "b.csv"],
     ):
         answer = shell.run_command("compare", *words, folder=tmp_path)
         assert (answer.status, answer.errors.count("\n")) == (2, 1)

@@ -51,7 +51,7 @@ def model() -> CascadedModel:
 
 
 def test_an_episode_ends_at_its_goal_or_out_of_time() -> None:
-    reached = rollout(Point(), Right(action_dimension=2), seed=0)
+    reached = rollout(Point(), Right(action_dimension=2), seed=np.int64(0))
     assert reached.outcome == "success" and reached.transitions[-1].centers[0, 0] > 0.9
     never = rollout(Point(stops=False), Right(action_dimension=2), seed=0)
     assert never.outcome == "timeout" and len(never.transitions) == Point.maximum_steps

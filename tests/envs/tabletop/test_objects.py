@@ -169,6 +169,8 @@ def test_a_scan_has_its_own_inertia_and_every_part_of_it_collides(scanned: Scene
     [
         (lambda folder: (folder / "angle_vhacd.obj").unlink(), "angle_vhacd.obj: No such file or directory"),
         (lambda folder: (folder / "meta.json").write_text('{"mug": {"mass": 1}}'), "damaged: KeyError('inertia_diag')"),
+        (lambda folder: (folder / "meta.json").write_text("{}"), "meta.json lists no object"),
+        (lambda folder: (folder / "mug_vhacd.obj").write_text("v 0 0 0\n"), "mug_vhacd.obj or mug.obj is cut"),
         (lambda folder: (folder / "mug_vhacd.obj").write_text("v nan 0 0\n"), "mug_vhacd.obj are no points in metres"),
     ],
 )

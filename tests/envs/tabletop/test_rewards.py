@@ -1,4 +1,4 @@
-"""Rewards as the paper's appendix "Task Details" defines them, those of gathering, and the remaining distance."""
+"""Rewards as the paper's appendix "Task Details" defines them, and the remaining distance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from cavin_pyro.envs.tabletop.layouts import load_task, parse_task
 from cavin_pyro.envs.tabletop.tasks import Outcome, Task, TaskReward
 from cavin_pyro.envs.tabletop.tasks.clearing import Clearing
 from cavin_pyro.envs.tabletop.tasks.crossing import Crossing
-from cavin_pyro.envs.tabletop.tasks.gathering import Gathering
 from cavin_pyro.envs.tabletop.tasks.insertion import Insertion
 from cavin_pyro.envs.tabletop.tasks.tiles import SPACING
 from cavin_pyro.envs.tabletop.workspace import TILE_SIDE, Tile, tile_center
@@ -239,38 +238,6 @@ def test_planners_keep_what_is_in_the_region_to_clear_within_the_tools_reach(
         moved = [before, *others], [after, *others]
         assert judge(AT_THE_ROBOT, *moved, margin=0.02).violation == dead_end
         assert not judge(AT_THE_ROBOT, *moved).violation  # the environment forbids nothing
-
-
-# Two tiles, x 0.37 to 0.52 and y -0.11 to 0.19.
-GATHERING = Gathering(region=[(1, 3), (1, 4)], target_start=[(1, 1)], obstacle_start=[(1, 6)])
-INSIDE, BESIDE, FAR = tile(1, 3), (0.54, 0.0), (0.72, 0.0)
-
-
-def test_gathering_succeeds_when_every_object_is_in_the_region() -> None:
-    assert judge(GATHERING, [INSIDE, BESIDE], [INSIDE, INSIDE]).success
-    for after in ([INSIDE, BESIDE], [BESIDE, INSIDE]):
-        outcome = judge(GATHERING, [INSIDE, INSIDE], after)
-        assert not outcome.success and not outcome.failure and outcome.reward == -1
-    just_inside, well_inside = (0.51, 0.0), (0.49, 0.0)
-    assert judge(GATHERING, [BESIDE], [just_inside]).success
-    assert not judge(GATHERING, [BESIDE], [just_inside], margin=0.02).success
-    assert judge(GATHERING, [BESIDE], [well_inside], margin=0.02).success
-
-
-def test_planners_keep_what_is_not_yet_gathered_within_the_tools_reach() -> None:
-    out_of_reach = (0.82, 0.0)  # the tool reaches x up to 0.80
-    moves = [(FAR, out_of_reach), (out_of_reach, out_of_reach), (out_of_reach, FAR)]
-    found = [bool(judge(GATHERING, [before], [after], margin=0.02).violation) for before, after in moves]
-    assert found == [True, False, False]
-    assert not judge(GATHERING, [FAR], [out_of_reach]).violation  # the environment forbids nothing
-
-
-def test_gathering_pulls_every_object_to_the_region() -> None:
-    outcome = judge(GATHERING, [FAR, FAR, INSIDE], [BESIDE, INSIDE, INSIDE], reward="dense")
-    assert outcome.terms["progress"].item() == pytest.approx(0.18 + 0.20)
-    assert outcome.reward.item() == pytest.approx(-1 + 0.38)  # not every object is inside
-    with pytest.raises(ValueError, match=r"^target_start tile \[1, 3\] is in the region to gather in$"):
-        Gathering(**{**vars(GATHERING), "target_start": [(1, 3)]})
 
 
 UPPER = [(1, column) for column in range(1, 6)]

@@ -107,3 +107,12 @@ def test_the_camera_sees_and_measures_the_same_with_tiles_and_without(task: str)
         np.testing.assert_array_equal(one, other)
     changed = (pictures[0] != pictures[1]).any(axis=-1).mean()
     assert 0.02 < changed < 0.5
+
+
+def test_pixels_that_the_image_has_not_are_refused(
+    scene: Scene, put: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.reset([put("mug", 0.5, 0.0)], np.random.default_rng(0))
+    monkeypatch.setattr(scene.segmenter, "follow", lambda image: [(np.array([-5]), np.array([0]))])
+    with pytest.raises(ValueError, match=r"^MaskSegmenter must give rows and columns within \[212, 256\]"):
+        scene.observe()

@@ -1,15 +1,23 @@
-"""The script that pushes towards the goal."""
+"""The floors: the script that pushes towards the goal, and the heuristic."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from cavin_pyro.envs.tabletop.layouts import parse_task
 from cavin_pyro.envs.tabletop.observation import ObservedPoints
-from cavin_pyro.envs.tabletop.scripted import GAP, LENGTHS, ScriptedPush
+from cavin_pyro.envs.tabletop.scripted import GAP, LENGTHS, HeuristicPush, ScriptedPush
 from cavin_pyro.envs.tabletop.tasks import TaskReward
-from cavin_pyro.envs.tabletop.workspace import POINTS_PER_OBJECT, REACH_HIGH, REACH_LOW, push_endpoints, tile_center
+from cavin_pyro.envs.tabletop.workspace import (
+    POINTS_PER_OBJECT,
+    REACH_HIGH,
+    REACH_LOW,
+    distance_to_path,
+    push_endpoints,
+    tile_center,
+)
 from cavin_pyro.models.state import State
 
 BRIDGE = [[2, column] for column in range(1, 6)]
@@ -58,3 +66,16 @@ def test_to_clear_the_object_is_pushed_that_is_still_inside() -> None:
     start, end = pushed("clearing", CLEARING, outside, inside)
     middle = (start + end) / 2 - torch.tensor(inside)
     assert middle.norm() < 0.06
+
+
+def test_the_heuristic_pushes_an_object_and_the_scene_decides_how() -> None:
+    reward = TaskReward(parse_task("crossing", CROSSING))
+    pushes = []
+    for x in (0.5, 0.5, 0.51):
+        state, observed = scene((x, 0.1))
+        pushes.append(HeuristicPush()(state, reward, observed))
+        start, end = push_endpoints(pushes[-1][0].numpy())
+        assert distance_to_path(np.array([x, 0.1]), start, end) < RADIUS + 0.03
+    assert torch.equal(pushes[0], pushes[1]) and not torch.equal(pushes[0], pushes[2])
+    with pytest.raises(ValueError, match=r"^planner=heuristic pushes on the tabletop alone"):
+        HeuristicPush()(state, reward, None)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
-from torch import Tensor
+from torch import Tensor, nan
 
 from cavin_pyro.planning import Addition, CavinPlanner, MpcPlanner
 from cavin_pyro.planning.additions import ADDITIONS, Choice, PerturbedRollouts, Touchdown
@@ -42,10 +43,11 @@ def test_a_users_own_addition_changes_plans(
     assert pushes[1] < 0.9 * pushes[0]
 
 
-def test_scores_of_another_shape_are_refused(toy: SimpleNamespace) -> None:
+@pytest.mark.parametrize("wrong", [lambda scores: scores[..., None], lambda scores: scores * nan])
+def test_scores_of_another_shape_and_nan_are_refused(toy: SimpleNamespace, wrong: Callable) -> None:
     class Wrong(Addition):
         def rank(self, scores: Tensor, choice: Choice) -> Tensor:
-            return scores[..., None]
+            return wrong(scores)
 
     planner = CavinPlanner(toy.PointMass(), samples=4, horizon=6, additions=[Wrong()])
     state, reward = toy.scenes([[(0.0, 0.0)]]), toy.GoalDisc(goal=(9.0, 0.0), dense=True)
