@@ -137,7 +137,7 @@ def checked(name: str, array: Any, dtype: torch.dtype, shape: Sequence[int | Non
         raise UserError(f"{name} has shape {[*given.shape]}, and must have {wanted}")
     tensor = given.detach().to(dtype) if not given.is_complex() else given
     if not tensor.isfinite().all():
-        raise UserError(f"{name} has numbers that are not finite: leave them out")
+        raise UserError(f"{name} has numbers that are not finite: a world must give others, and data leave them out")
     if tensor.is_complex() or not (dtype.is_floating_point or bool((tensor == given).all())):
         raise UserError(f"{name} has {given.dtype} numbers, which are no {dtype}".replace("torch.", ""))
     return tensor

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from cavin_pyro import __version__
 from cavin_pyro.config.composition import compose
-from cavin_pyro.config.errors import UserError, user_input
+from cavin_pyro.config.errors import UserError, one_line, user_input
 from cavin_pyro.config.world import world_of
 from cavin_pyro.data import dataset
 from cavin_pyro.data.dataset import Arrays
@@ -45,19 +45,19 @@ def import_minari(name: str, target: Path, env: Sequence[str]) -> dict[str, Any]
     world, section = world_of(config), OmegaConf.to_container(config.world)
     if world is None or not isinstance(section, dict):
         raise UserError("--env tabletop: episodes of the tabletop have clouds, which no other dataset has")
-    identity = name.removeprefix("minari:")
+    identity, episodes = name.removeprefix("minari:"), []
     try:
         source = minari.load_dataset(identity)
-    except (OSError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise UserError(f"no whole dataset minari:{identity} here ({said}): minari download {identity}") from error
-    episodes = []
-    with progress_bar("importing", total=int(source.total_episodes), unit="episode") as bar:
-        for number, one in enumerate(source.iterate_episodes()):
-            with user_input(where=f"episode {number} of minari:{identity}"):
-                states = [world.state(_at(one.observations, step)) for step in range(len(one) + 1)]
-                episodes.append(of_states(world, states, one.actions))
-            bar.update()
+        with progress_bar("importing", total=int(source.total_episodes), unit="episode") as bar:
+            for number, one in enumerate(source.iterate_episodes()):
+                with user_input(where=f"episode {number} of minari:{identity}"):
+                    states = [world.state(_at(one.observations, step)) for step in range(len(one) + 1)]
+                    episodes.append(of_states(world, states, one.actions))
+                bar.update()
+    except UserError:
+        raise
+    except Exception as error:  # whatever Minari and HDF5 raise for files that are missing or damaged
+        raise UserError(f"no whole minari:{identity} here ({one_line(error)}): minari download {identity}") from error
     steps = max((len(one["actions"]) for one in episodes), default=0)
     if not 1 <= steps <= dataset.LARGEST["S"]:
         raise UserError(f"minari:{identity} has episodes of up to {steps} steps: from 1 to {dataset.LARGEST['S']} fit")

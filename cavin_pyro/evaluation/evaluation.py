@@ -115,8 +115,7 @@ def run_missing(evaluations: Sequence[DictConfig], workers: int) -> list[list[Ro
 def seeds_of(config: DictConfig) -> Sequence[int]:
     """The seeds of an evaluation's episodes, or of those in its shard; one without an episode is a `UserError`."""
     if config.seed + config.episodes > MAXIMUM_SEED + 1:
-        said = f"seed={config.seed} leaves no room for episodes={config.episodes} up to {MAXIMUM_SEED}"
-        raise UserError(f"{said}: lower one of them")
+        raise UserError(f"seed={config.seed} and episodes={config.episodes} go beyond {MAXIMUM_SEED}: lower one")
     seeds = of_shard(range(config.seed, config.seed + config.episodes), config.shard)
     if not seeds:
         raise UserError(f"shard={config.shard} has none of {config.episodes} episodes: choose a smaller n")

@@ -177,7 +177,6 @@ def rollout(
     with user_input():
         check_number("push_decimals", 1 if push_decimals is None else push_decimals, 1, 6, whole=True)
         check_number("seed", seed, 0, MAXIMUM_SEED, whole=True)
-    seed = int(seed)  # Gymnasium takes no other kind of whole number
     if getattr(getattr(planner, "model", None), "space", env.space) != env.space:
         raise UserError(f"the planner's model is of a world with other dimensions or units than {type(env).__name__}")
     if photograph and env.render_mode is None:
@@ -185,7 +184,7 @@ def rollout(
     if start is not None:
         with user_input(where="start is no observation as of env.reset or env.step"):
             env.state(start)
-    episode = Episode(seed)
+    episode = Episode(seed := int(seed))  # Gymnasium takes no other kind of whole number
     generator = torch.Generator().manual_seed(planner_seed(seed))
 
     def on_frame() -> None:

@@ -251,7 +251,7 @@ class PushingEnv(Uncopied, World):
         """See `World` and `state_of`."""
         if not callable(self.geometry):
             raise ValueError(
-                "the state of the table needs the geometry of a checkpoint, which makes features of clouds"
+                "the table's state needs a checkpoint's geometry: make_env(..., geometry=load(NAME).geometry)"
             )
         return state_of(observation, self.geometry)
 

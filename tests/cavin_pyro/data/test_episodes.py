@@ -230,7 +230,8 @@ def test_a_dataset_of_minari_is_imported_and_trains(
         ({"largest": 5.0}, "actions has numbers as large as 5, out of the box"),
         ({"flaw": float("nan")}, "centers has numbers that are not finite"),
         ({"size": 3}, "actions has shape [9, 3], and must have [any, 2]"),
-        (None, "no dataset minari:line-v0 here"),
+        (None, "no whole minari:line-v0 here"),
+        ({}, "no whole minari:line-v0 here"),  # damaged
     ],
 )
 def test_what_a_world_cannot_read_is_refused_before_anything_is_written(
@@ -240,5 +241,7 @@ def test_what_a_world_cannot_read_is_refused_before_anything_is_written(
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     if flaws is not None:
         minari_dataset("line-v0", **flaws)  # type: ignore[arg-type]
+    if flaws == {}:
+        next((tmp_path / "minari").rglob("*.hdf5")).write_bytes(b"cut")
     status, _, error = data("import", "minari:line-v0", "--to", tmp_path / "line", "--env", POINT["_target_"])
     assert status == 2 and said in error and not (tmp_path / "line").exists()
