@@ -187,8 +187,8 @@ class Scene(Uncopied):
     def _pixels(self, image: DepthImage, found: list[Pixels]) -> list[Pixels]:
         """What a segmentation found; raises ValueError for pixels that the image has not."""
         for indices in found:
-            for index, size in zip(indices, image.depth.shape, strict=True):
-                if np.asarray(index).dtype.kind not in "iu" or not ((index >= 0) & (index < size)).all():
+            for index, size in zip(map(np.asarray, indices), image.depth.shape, strict=True):
+                if index.size and (index.dtype.kind not in "iu" or not ((index >= 0) & (index < size)).all()):
                     wanted = f"rows and columns within {[*image.depth.shape]} for each object"
                     raise ValueError(f"{type(self.segmenter).__name__} must give {wanted}, not {told(indices)}")
         return found

@@ -1,4 +1,4 @@
-"""Rollouts with perturbed pushes (our addition to Algorithm 1, line 10, and to the baselines)."""
+"""Rollouts with perturbed actions (our addition to Algorithm 1, line 10, and to the baselines)."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ RETURN_WEIGHT = 0.0015
 
 @dataclass(frozen=True)
 class PerturbedRollouts(Addition):
-    """Ranks the best motions by rollouts whose pushes start at perturbed places (docs/explanation/planning.md).
+    """Ranks the best motions by rollouts of perturbed actions (docs/explanation/planning.md).
 
     Without a tracking cost, in the baselines, the score of a plan is its return minus `failure_cost / RETURN_WEIGHT`
     times the fraction of failed rollouts, by default 200 times: about the expected return of a plan with predicted
-    success. Plans that reach the goal rank first, since the rollouts of others may have stopped early and pushes that
-    do nothing never fail. Where plans have subgoals of their own, those that miss the goal are ranked by return alone:
-    the pushes that move least would end closest to their own subgoals.
+    success. Plans that reach the goal rank first, since the rollouts of others may have stopped early and actions
+    that do nothing never fail. Where plans have subgoals of their own, those that miss the goal are ranked by return
+    alone: the actions that move least would end closest to their own subgoals.
 
     Sequential halving (Karnin, Koren and Somekh, ICML 2013) allocates the rollouts; after each round the best
     candidates, one in `reduction_factor`, continue with `reduction_factor` times as many rollouts each.
@@ -43,7 +43,7 @@ class PerturbedRollouts(Addition):
     rounds: number of rounds, each with as many rollouts in total, for fewer and fewer candidates; 1 gives every
         candidate the same number.
     reduction_factor: how many times fewer candidates a round has than the one before.
-    start_noise: standard deviation of a push's start, in normalised units (1 is half the reachable box).
+    start_noise: standard deviation of an action's first two numbers, on the table the push's start.
     failure_cost: square metres that a predicted failure adds to the squared distance to the subgoal. Where returns
         count, one unit of return weighs 0.0015 square metres.
 
@@ -140,21 +140,21 @@ def perturbed_rollouts(
     scene, backend = choice.scene, choice.candidates.problem.backend
     if goal is not None and goal.batch_shape[-1] > 1:
         goal = goal.map(lambda field: field.repeat_interleave(count, 1))  # [B, R count]
-    pushes = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, n, A]
-    half = noise_each((-(-count // 2), pushes.shape[-2], 2), scene.generators, pushes.device)
+    tried = actions.unsqueeze(2).repeat(1, 1, count, 1, 1).flatten(1, 2)  # [B, R count, n, A]
+    half = noise_each((-(-count // 2), tried.shape[-2], 2), scene.generators, tried.device)
     noise = torch.cat((half, -half), 1)[:, :count]  # antithetic: its mean is 0 for an even count
-    pushes[..., :2] += robustness.start_noise * noise.repeat(1, actions.shape[1], 1, 1)  # the same for every motion
-    pushes = pushes.clamp(-1.0, 1.0)
-    costs, failed = backend(_rollout_costs, choice.model, scene.reward, scene.state, goal, pushes, choice.distance)
+    tried[..., :2] += robustness.start_noise * noise.repeat(1, actions.shape[1], 1, 1)  # the same for every motion
+    tried = tried.clamp(-1.0, 1.0)
+    costs, failed = backend(_rollout_costs, choice.model, scene.reward, scene.state, goal, tried, choice.distance)
     return costs.unflatten(1, (-1, count)), failed.unflatten(1, (-1, count))
 
 
 def _rollout_costs(
-    model: TransitionModel, reward: Reward, state: State, goal: State | None, pushes: Tensor, distance: SubgoalDistance
+    model: TransitionModel, reward: Reward, state: State, goal: State | None, actions: Tensor, distance: SubgoalDistance
 ) -> tuple[Tensor, Tensor]:
-    """Rollouts of `pushes: [B, n, T, 4]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
-    plans = state.expand_plans(pushes.shape[1])
-    end, path = predict_states(model, state.expand_plans(1), pushes, reward.reads_features)
+    """Rollouts of `actions: [B, n, T, A]` by f: square metres to the `goal` and whether they fail, `[B, n]` each."""
+    plans = state.expand_plans(actions.shape[1])
+    end, path = predict_states(model, state.expand_plans(1), actions, reward.reads_features)
     start = plans.values(reward.reads_features)
     progress = returns.advance(returns.start(plans.centers), reward, start, path, plans.mask)
     if goal is None:
