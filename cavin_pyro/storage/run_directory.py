@@ -35,12 +35,10 @@ def check_same_run(folder: Path, config: DictConfig, *, ignore: tuple[str, ...])
         earlier = stored_options(path)
     now = flat_options(OmegaConf.to_container(config, resolve=True))
     for name in sorted(set(now) | set(earlier)):
-        if name not in ignore and (name in now) != (name in earlier):
-            raise UserError(f"{folder} holds a run of another command, or version: choose another output=DIR")
         if name not in ignore and now.get(name) != earlier.get(name):
             raise UserError(
                 f"{folder} holds a run with {name}={shown(earlier.get(name))}, not {shown(now.get(name))}: "
-                "resume with the same options, or choose another output=DIR"
+                "resume it with its own command and options, or choose another output=DIR"
             )
 
 

@@ -56,7 +56,7 @@ def test_a_run_with_another_configuration_is_refused_and_the_option_is_named(
     write_config(tmp_path, config())
     check_same_run(tmp_path, config(**changes), ignore=())  # it may begin otherwise before its first result
     (tmp_path / "metrics.csv").touch()
-    with pytest.raises(UserError, match=f"{said}: resume with the same options, or choose another output=DIR"):
+    with pytest.raises(UserError, match=f"{said}: resume it with its own command and options, or "):
         check_same_run(tmp_path, config(**changes), ignore=())
 
 
