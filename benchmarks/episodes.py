@@ -86,7 +86,7 @@ SUCCESS = [
     *of_each_task("script without a model, 3 objects", "planner=scripted"),
     *(row for seed in range(3) for row in of_each_task(f"quickstart, seed {seed}", MADE.format(seed))),
 ]
-PLANNERS = {
+PLANNERS: dict[str, tuple[str, ...]] = {
     "ours": (),
     **{one.label: one.planners["paper"] for one in METHODS.values() if one.in_paper},
     "script": ("planner=scripted",),
@@ -96,6 +96,14 @@ LAYOUTS = [
     row
     for (name, options), layout in product(PLANNERS.items(), range(3))
     for row in of_each_task(f"{name}, layout {layout}", f"layout={layout}", "criterion=published", *options)
+]
+
+CROWDS = "planner.add=[guidance,{_target_:cavin_pyro.planning.additions.NearestObjects,of_all:2}]", "checkpoint=crowded"
+HARDER = {**PLANNERS, "ours": ("planner.add=[guidance]",), "ours, for crowds": CROWDS}
+HARD = [
+    Row(name, task, objects, ("layout=hard", *SEEN, "env.ranges.clearance=0.1", *options))
+    for name, options in HARDER.items()
+    for task, objects in (("clearing", 9), ("insertion", 5), ("crossing", 9))
 ]
 
 
@@ -130,13 +138,11 @@ TRAININGS = 3  # runs/pusht-0 and so on, by docs/how-to/push-t.md, pusht-normal-
 PUSHT = {
     "75 ahead": ("env=pusht",),
     "25 ahead": ("env=pusht", "env.ahead=25", "env.maximum_steps=10"),
-    "coverage": ("env=pusht", "env.criterion=coverage", "env.maximum_steps=60"),
 }
 BOTH = ("75 ahead", "25 ahead")
-DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6", "coverage": "planner.horizon=15"}
+DEPTH = {"75 ahead": "planner.horizon=15", "25 ahead": "planner.horizon=6"}
 CASCADE = (*RECIPES["pusht"].plan.split(), "checkpoint=runs/pusht-{}/checkpoint.safetensors")
 QUICK = "checkpoint=runs/quickstart/pusht-20-{}/train/checkpoint.safetensors"  # by quickstart env=pusht seed=0, 1, 2
-SHOOTING = (*(option for option in CASCADE if "optimizer" not in option), "planner.optimizer=shooting")
 ACTIONS = ("planner=mpc", "planner.additions=[]")
 FLAT = (*ACTIONS, "pushes_per_plan=null", *CASCADE, "planner.add=[]")
 
@@ -153,15 +159,13 @@ WORLDS = [
     *pusht("cascade, no other effects", *CASCADE, "planner.add=[perturbed_rollouts]"),
     *pusht("cascade, N(0, I)", *CASCADE, "checkpoint=runs/pusht-normal-{}/checkpoint.safetensors"),
     *pusht("flat: actions", *FLAT, tasks=BOTH),
-    *pusht("flat: actions, 8,192 samples", *FLAT, "planner.samples=8192"),
     *(Row("random actions", task, None, (*PUSHT[task], "planner=random")) for task in BOTH),
     Row("random actions", "maze", None, ("env=maze", "planner=random")),
     Row("cascade", "maze", None, (*MAZE, "planner.motion_horizon=first_segment", "planner.samples=4096")),
     Row("flat: actions", "maze", None, (*MAZE, *ACTIONS, "planner.samples=2048", "planner.optimizer=cem")),
-    *pusht("cascade, shooting", *SHOOTING),
-    *pusht("cascade, gym-pusht's criterion", *CASCADE, tasks=["coverage"]),
 ]
-TABLES = {"success": SUCCESS, "layouts": LAYOUTS, "farther": FARTHER, "additions": ADDITIONS, "worlds": WORLDS}
+TABLES = {"success": SUCCESS, "layouts": LAYOUTS, "hard": HARD, "farther": FARTHER}
+TABLES |= {"additions": ADDITIONS, "worlds": WORLDS}
 _runner: tuple[list[str], EpisodeRunner] | None = None  # one per process
 
 

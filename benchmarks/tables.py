@@ -232,6 +232,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
     "success": success,
     "layouts": lambda: success("layouts"),
+    "hard": lambda: success("hard"),
     "farther": lambda: success("farther"),
     "additions": additions,
     "reproduction": reproduction,

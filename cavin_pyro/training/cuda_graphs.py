@@ -25,15 +25,15 @@ def capturable(loss: Loss, window: Window) -> bool:
     """Whether a graph has the value and the gradients of this loss.
 
     The bound must be `Trace_ELBO` with one particle, whose loss for codes that are reparameterised is the sum of
-    `elbo_terms` (Pyro's own method waits for the GPU at every site), without weights of KL terms and a counterfactual
-    term. A subclass of the objective may do anything else.
+    `elbo_terms` (Pyro's own method waits for the GPU at every site), without weights of KL terms. A subclass of the
+    objective may do anything else.
     """
     objective = loss.objective
     if type(objective) is not Objective or type(loss) is not Loss or not loss.guide.amortized:
         return False
     if type(objective.elbo) is not Trace_ELBO or objective.elbo.num_particles != 1:
         return False
-    if objective.weighted or objective.counterfactual_weight:
+    if objective.weighted:
         return False
     with forked(window.actions.device), torch.no_grad():
         sites = latent_sites(poutine.trace(loss.guide).get_trace(window))

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from pyro import infer, poutine
+from pyro import infer
 from pyro.infer import ELBO, RenyiELBO, Trace_ELBO
 from pyro.poutine.messenger import Messenger
 from torch import Tensor, nn
@@ -23,20 +23,19 @@ SMOOTHING = 1e-6  # of squared distances between centres, and between features; 
 
 
 class Objective:
-    """A bound, with optional weights of its KL terms, their warm-up, and two other terms.
+    """A bound, with optional weights of its KL terms, their warm-up, and a term of rollouts.
 
     loss = -bound(with KL term i weighted by w_i * min(1, (step + 1) / warm_up_steps))
-           + counterfactual_weight * counterfactual_loss + rollout_weight * rollout_loss
+           + rollout_weight * rollout_loss
 
     With weights of one, no warm-up and no other term, the defaults, this is the bound and nothing else.
 
     The validation loss, by which training chooses the best checkpoint, is another: -ELBO from one sample of the codes,
-    whatever the bound and its weights, and the rollout term. It has no counterfactual term.
+    whatever the bound and its weights, and the rollout term.
 
     Args:
         elbo: any of Pyro's ELBOs. kl_weights: weight of each code's KL term, positive.
         warm_up_steps: steps over which the weights of the codes' log densities, of prior and guide, grow from near 0.
-        counterfactual_weight: weight of the published code's term, see `counterfactual_loss`.
         rollout_weight: weight of the error where f reads its own predictions, see `rollout_loss`. The bound contains
             each step already, so a weight trades its density for the accuracy of rollouts.
 
@@ -50,24 +49,18 @@ class Objective:
         *,
         kl_weights: Mapping[str, float] | None = None,
         warm_up_steps: int = 0,
-        counterfactual_weight: float = 0.0,
         rollout_weight: float = 0.0,
     ) -> None:
         self.elbo = elbo
         self.kl_weights = {str(name): float(weight) for name, weight in (kl_weights or {}).items()}
         self.warm_up_steps = warm_up_steps
-        self.counterfactual_weight = counterfactual_weight
         self.rollout_weight = rollout_weight
         for name, weight in self.kl_weights.items():
             if name not in CODES:
                 raise ValueError(f"objective.kl_weights has no {name!r}: choose from {', '.join(CODES)}")
             check_number(f"objective.kl_weights.{name}", weight, positive=True)
-        for name in ("warm_up_steps", "counterfactual_weight", "rollout_weight"):
+        for name in ("warm_up_steps", "rollout_weight"):
             check_number(f"objective.{name}", getattr(self, name))
-        if counterfactual_weight and elbo.num_particles != 1:
-            raise ValueError(f"the counterfactual term takes one particle, not {elbo.num_particles}")
-        if counterfactual_weight and not isinstance(elbo, DifferentiableBound):
-            raise ValueError(f"the counterfactual term takes objective.elbo Trace_ELBO, not {type(elbo).__name__}")
         if isinstance(elbo, COMPILED):
             raise ValueError(
                 f"objective.elbo {type(elbo).__name__} compiles with torch.jit.trace, which takes windows apart and "
@@ -92,18 +85,13 @@ class Objective:
     def check(self, model: Model, guide: Guide | None = None) -> None:
         """Check that a model, and a guide, are compatible with this objective.
 
-        A `ValueError` says why they are not: no codes where particles or a counterfactual term need them, or a guide
-        with parameters for each window, whose auxiliary sites this bound leaves out.
+        A `ValueError` says why they are not: no codes where particles need them, or a guide with parameters for each
+        window, whose auxiliary sites this bound leaves out.
         """
         if guide is not None and not guide.amortized and (type(self.elbo) is not Trace_ELBO or self.weighted):
             raise ValueError(
                 f"guide {type(guide).__name__} samples auxiliary sites, which this objective leaves out: "
                 "choose objective=trace_elbo, without objective.kl_weights and objective.warm_up_steps"
-            )
-        if self.counterfactual_weight and not model.codes:
-            raise ValueError(
-                f"objective counterfactual needs a model that generates actions, and {type(model).__name__} does not: "
-                "choose model= from cascaded, single_latent, flat"
             )
         if self.elbo.num_particles > 1 and not model.codes:
             raise ValueError(
@@ -145,12 +133,7 @@ class Loss(nn.Module):
         if not isinstance(elbo, DifferentiableBound):
             return loss_with_gradients(elbo, model, guide, window, list(self.parameters()))
         with self.model.encoding(window):
-            if not objective.counterfactual_weight:
-                return elbo.differentiable_loss(model, guide, window)
-            guided = poutine.trace(self.guide).get_trace(window)
-            loss = elbo.differentiable_loss(model, poutine.replay(guide, trace=guided), window)
-        codes = {name: guided.nodes[name]["value"] for name in CODES if name in guided.nodes}
-        return loss + objective.counterfactual_weight * counterfactual_loss(self.model, window, codes)
+            return elbo.differentiable_loss(model, guide, window)
 
 
 class _Weighted(Messenger):
@@ -169,24 +152,6 @@ class _Weighted(Messenger):
 def as_objective(objective: Objective | ELBO) -> Objective:
     """An objective, also from a plain ELBO of Pyro's or a user's; anything else is a `ValueError`."""
     return Objective(objective) if isinstance(objective, ELBO) else objective
-
-
-def counterfactual_loss(model: Model, window: Window, codes: Mapping[str, Any]) -> Tensor:
-    """Negative log density of s' around f's prediction for the generated actions, summed over the windows `[B]`.
-
-    a = mean of g(. | s, c, z), s_t+1 = mean of f(. | s_t, a_t) for t = 0, ..., T - 1, and s_T is compared with
-    s' under the likelihood scales. Objects count that are real in both, windows where `sequence_mask` is set.
-    The term is of the published code, for an ablation; the paper asserts that the actions of (s, c, z) lead to h(s, c).
-
-    `codes`: the sampled `effect_code` and `motion_code`, those of the two that the model has.
-    """
-    state, last = window.first, window.last
-    for action in model.actions(state, **codes).unbind(-2):
-        state = model.next_state(state, action)
-    real = window.first.mask & last.mask
-    scored = model.scales.centers(state, real).log_prob(last.centers)
-    scored = scored + model.scales.features(state, real).log_prob(last.features)
-    return -scored.where(window.sequence_mask, 0.0).sum()
 
 
 def rollout_loss(model: Model, window: Window) -> Tensor:

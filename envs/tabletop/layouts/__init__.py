@@ -1,7 +1,7 @@
 """Layouts: files that list the tiles of a task's fields.
 
-`TASK_N.yaml` in this folder is layout N of a task; any other file of that form is a new layout
-(docs/how-to/your-own-layout.md).
+`TASK_N.yaml` in this folder is layout N of a task, `TASK_hard.yaml` our layout whose way is blocked; any other file of
+that form is a new layout (docs/how-to/your-own-layout.md).
 
 Source of the layouts of the paper's three tasks: appendix "Task Details"; the published implementation.
 """
@@ -22,7 +22,7 @@ from cavin_pyro.envs.tabletop.tasks.reach import check_reach
 from cavin_pyro.envs.tabletop.tasks.tiles import TileSet
 from cavin_pyro.models.checks import check_choice
 
-RANDOM, GENERATED = "random", "generated"
+RANDOM, GENERATED, HARD = "random", "generated", "hard"
 MOST = 100_000  # characters of a layout
 _FOLDER = Path(__file__).parent
 
@@ -139,12 +139,13 @@ def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
 
 
 def _path(kind: type[Task], layout: int | str | Path) -> Path:
-    name = str(layout)
-    if not name.isdecimal():
+    name = str(int(layout)) if str(layout).isdecimal() else str(layout)
+    path = _FOLDER / f"{kind.name}_{name}.yaml"
+    if name != HARD and not name.isdecimal():
         return Path(name)
-    if int(name) not in layout_numbers(kind):
+    if not path.exists():
         raise ValueError(f"unknown layout {name}: choose {_choices(kind)}")
-    return _FOLDER / f"{kind.name}_{int(name)}.yaml"
+    return path
 
 
 def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
@@ -168,5 +169,6 @@ def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
 
 def _choices(kind: type[Task]) -> str:
     """`0, 1, 2, random or the path of a YAML file`, as far as the task has them."""
-    names = [*(str(number) for number in layout_numbers(kind)), RANDOM, GENERATED]
+    own = sorted(path.stem.removeprefix(f"{kind.name}_") for path in _FOLDER.glob(f"{kind.name}_*.yaml"))
+    names = [*own, RANDOM, GENERATED]
     return f"{', '.join(names)} or the path of a YAML file" if len(names) > 2 else "the path of a YAML file"

@@ -33,7 +33,7 @@ BAD = [  # (command, options added to the good ones, what the line must say)
     ("check", "sizes.elbo=null", "sizes.elbo is a section of options, sizes.elbo.NAME=VALUE, which null cannot"),
     ("plan", "+planner.unknown=1", "planner.unknown=1: cavin_pyro.planning.CavinPlanner cannot be built: "),
     ("evaluate", "env.camera._target_=my_lab.Mine", "env.camera._target_=my_lab.Mine: my_lab.Mine cannot be built: "),
-    ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, random, generated or the path of a YAML file"),
+    ("plan", "layout=7", "unknown layout 7: choose 0, 1, 2, hard, random, generated or the path of a YAML file"),
     ("plan", "env.robot=sawyer", "robot sawyer needs a folder"),
     ("plan", "objects=5 env.ranges.clearance=1", "no room for 5 objects at least 1 m apart"),
     ("plan", "checkpoint=@nothing", "no checkpoint at"),

@@ -114,7 +114,7 @@ BAD = [  # overrides of `plan` unless another command is named, and what the lin
     ("planner.add={guidance:1}", "planner.add must be a list, such as [a,b]"),
     ("output=", "output= is empty: name a folder, or leave it out"),
     ("train guide=[]", "guide must be one of auto_iaf, "),
-    ("train objective=[1,2]", "; choose from counterfactual, iwae, "),
+    ("train objective=[1,2]", "; choose from iwae, "),
     ("train windows.held_out_objects=[[]]", "windows.held_out_objects must be a plain list such as [a,b], not [[]]"),
     ("video=${oc.decode:'maybe'}", "'maybe' is not a valid bool"),
     (f"seed={'1' * 5000}", "value has 5000 digits"),

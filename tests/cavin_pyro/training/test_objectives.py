@@ -24,7 +24,7 @@ from cavin_pyro.models.networks.layers import fixed_shapes
 from cavin_pyro.models.state import State, Window
 from cavin_pyro.training.cuda_graphs import capturable, capturable_loss
 from cavin_pyro.training.elbo import elbo_terms, term_counts
-from cavin_pyro.training.objectives import Loss, Objective, as_objective, counterfactual_loss, rollout_loss
+from cavin_pyro.training.objectives import Loss, Objective, as_objective, rollout_loss
 from cavin_pyro.training.run import build_objective
 
 Programs = tuple[nn.Module, nn.Module]
@@ -140,28 +140,6 @@ def test_a_bound_with_gradients_of_its_own_leaves_those_that_exist(programs: Pro
     assert not list(pyro.get_param_store())
 
 
-def test_the_counterfactual_term_rolls_generated_pushes_through_the_dynamics(
-    programs: Programs, window: Window
-) -> None:
-    model, guide = programs
-    torch.manual_seed(7)
-    guided = poutine.trace(guide).get_trace(window)
-    codes = {code: guided.nodes[code]["value"] for code in ("effect_code", "motion_code")}
-    pushes, total = model.actions(window.first, **codes), torch.zeros((), dtype=torch.float64)
-    for number in window.sequence_mask.nonzero().flatten().tolist():
-        state = State(*(field[number : number + 1] for field in window.first))
-        for step in range(3):
-            state = model.next_state(state, pushes[number : number + 1, step])
-        real = window.first.mask[number]
-        for field, scale in (("centers", 0.01), ("features", 0.1)):
-            mean, observed = getattr(state, field)[0][real], getattr(window.last, field)[number][real]
-            total = total - torch.distributions.Normal(mean, scale).log_prob(observed).sum()
-    assert counterfactual_loss(model, window, codes).item() == pytest.approx(total.item(), rel=1e-9)
-    # In the objective it has the codes of the bound.
-    objective = Objective(Trace_ELBO(max_plate_nesting=1), counterfactual_weight=0.3)
-    assert_same(loss_at(objective, programs, window), sum(terms(programs, window).values()) + 0.3 * total, programs)
-
-
 def test_the_rollout_term_is_the_distance_of_predictions_from_predictions(programs: Programs, window: Window) -> None:
     model, total = programs[0], 0.0
     for number in range(6):
@@ -190,10 +168,8 @@ def test_the_rollout_term_is_the_distance_of_predictions_from_predictions(progra
     [
         ({"kl_weights": {"code": 1.0}}, "kl_weights has no 'code'"),
         ({"kl_weights": {"effect_code": 0.0}}, "kl_weights.effect_code must be a number above 0"),
-        ({"elbo": Trace_ELBO(num_particles=2), "counterfactual_weight": 1.0}, "takes one particle"),
         ({"elbo": RenyiELBO(), "warm_up_steps": 10}, "has no KL terms to weight"),
         ({"elbo": JitTrace_ELBO()}, "JitTrace_ELBO compiles with torch.jit.trace"),
-        ({"elbo": TraceGraph_ELBO(), "counterfactual_weight": 1.0}, "takes objective.elbo Trace_ELBO"),
     ],
 )
 def test_an_invalid_objective_is_refused(options: dict, said: str) -> None:
@@ -241,7 +217,7 @@ def test_the_loss_that_a_cuda_graph_captures_is_the_objective(options: tuple[str
 
 def test_other_losses_are_not_captured() -> None:
     batch = windows(torch.float32)
-    for option in ("objective=iwae", "objective=counterfactual", "objective.warm_up_steps=10"):
+    for option in ("objective=iwae", "objective.warm_up_steps=10"):
         assert not capturable(bound_loss(option), batch)
 
     class Rough(distributions.Normal):

@@ -50,6 +50,14 @@ def test_all_objects_count_where_the_goal_is_about_them(toy: SimpleNamespace) ->
     assert found["crossing"].indices is not None
 
 
+def test_of_all_objects_those_with_the_shortest_ways_left_count_and_none_that_has_arrived() -> None:
+    places = torch.tensor([[[0.52, 0.1, 0.0], [0.4, 0.1, 0.0], [0.3, 0.1, 0.0], [0.5, 0.45, 0.0], [0.5, 0.2, 0.0]]])
+    state = State(places, places, torch.ones(1, 5, dtype=torch.bool))
+    query = Query(state, TaskReward(load_task("clearing", 1)), [])  # objects 2 and 3 are outside of its region
+    for most, nearest in ((2, [1, 4]), (3, [0, 1, 4])):
+        assert NearestObjects(of_all=most).focus(Focus(), query).indices.tolist() == [nearest]
+
+
 @given(st.permutations(range(1, 6)), st.integers(1, 5))
 def test_objects_go_back_to_their_places(order: list[int], most: int) -> None:
     state, indices = scene(), torch.tensor([sorted([0, *order[:most]])])
