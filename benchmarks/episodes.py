@@ -98,11 +98,9 @@ LAYOUTS = [
     for row in of_each_task(f"{name}, layout {layout}", f"layout={layout}", "criterion=published", *options)
 ]
 
-CROWDS = "planner.add=[guidance,{_target_:cavin_pyro.planning.additions.NearestObjects,of_all:2}]", "checkpoint=crowded"
-HARDER = {**PLANNERS, "ours": ("planner.add=[guidance]",), "ours, for crowds": CROWDS}
 HARD = [
     Row(name, task, objects, ("layout=hard", *SEEN, "env.ranges.clearance=0.1", *options))
-    for name, options in HARDER.items()
+    for name, options in (PLANNERS | {"ours": ("planner.add=[guidance]",)}).items()
     for task, objects in (("clearing", 9), ("insertion", 5), ("crossing", 9))
 ]
 
@@ -112,8 +110,11 @@ def generated(task: str, tiles: int) -> Row:
     return Row(f"generated, {tiles} tiles", task, 3, options)
 
 
+FEW = "planner.add=[{_target_:cavin_pyro.planning.additions.NearestObjects,of_all:2}]"
 FARTHER = [
     Row("8 objects", "crossing", 8, ("planner.horizon=60",)),
+    Row("8 objects, effects of all", "clearing", 8, ("layout=1", "env.ranges.clearance=0.1")),
+    Row("8 objects, effects of two", "clearing", 8, ("layout=1", "env.ranges.clearance=0.1", FEW)),
     *(generated("crossing", tiles) for tiles in (6, 9, 12)),
     *(generated("insertion", tiles) for tiles in (5, 7)),
     *(generated("clearing", tiles) for tiles in (6, 9, 14)),

@@ -90,9 +90,7 @@ def test_files_that_are_no_layout_get_one_line(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"mine\.yaml has the key 'a' twice"):
         load_task("crossing", write(tmp_path, "a: []\na: [[1, 2]]"))
     for layout in ("nowhere.yaml", -1, tmp_path):
-        with pytest.raises(
-            ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, hard, random, generated or"
-        ):
+        with pytest.raises(ValueError, match=r"cannot be read \(.*\): give 0, 1, 2, hard, random, generated or"):
             load_task("crossing", layout)
     with pytest.raises(ValueError, match=r"crossing_0\.yaml with overrides: goal tile \[4, 6\] is off the bridge, add"):
         load_task("crossing", 0, {"goal": [[4, 6]]})
