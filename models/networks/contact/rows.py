@@ -67,7 +67,7 @@ class Rows:
         both, ways = firsts & seconds, [seconds, firsts]  # whether the other one counts, one way and the other
         if near is not None:
             orders = (first, second), (second, first)
-            ways = [way & near[order].flatten(1) for way, order in zip(ways, orders, strict=True)]
+            ways = [way & near[order].view(len(first), -1) for way, order in zip(ways, orders, strict=True)]
             both &= ways[0] | ways[1]
         found, count = self._numbers(both)
         if not count:

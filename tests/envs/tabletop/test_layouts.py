@@ -250,6 +250,7 @@ def test_a_start_from_which_the_tool_cannot_push_to_the_goal_is_refused(
 
 def test_pushes_solve_every_shipped_random_and_generated_layout() -> None:
     shipped = [load_task(task, number) for task in TASKS for number in layout_numbers(task)]
+    shipped += [load_task(task, "hard") for task in ("clearing", "insertion", "crossing")]
     for one in (*shipped, *SLOTS):
         check_reach(one)
     for task, tiles, seed in product(("crossing", "clearing", "insertion"), (4, 6, 8), range(5)):

@@ -76,8 +76,13 @@ def test_a_step_reports_all_that_happened(make: Make) -> None:
     assert info["ineffective"] and not any(info[name] for name in ("unsafe", "success", "violation", "fall"))
 
 
-@pytest.mark.parametrize(("task", "layout"), [(task, number) for task in TASKS for number in layout_numbers(task)])
-def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(make: Make, task: str, layout: int) -> None:
+LAYOUTS = [(task, number) for task in TASKS for number in layout_numbers(task)]
+
+
+@pytest.mark.parametrize(
+    ("task", "layout"), [*LAYOUTS, ("clearing", "hard"), ("insertion", "hard"), ("crossing", "hard")]
+)
+def test_objects_start_on_their_tiles_in_an_episode_still_to_be_played(make: Make, task: str, layout: Any) -> None:
     env = make(task=task, layout=layout, objects=3)
     observed, _ = env.reset(seed=0)
     centers = torch.from_numpy(observed["centers"])

@@ -220,6 +220,7 @@ def test_other_objects_matter_but_only_the_nearest_if_there_are_more_than_neighb
     near = f(state, None, action).centers[:, :2]
     state.centers[0, 2, 1] += 0.05
     assert torch.allclose(f(state, None, action).centers[:, :2], near, atol=1e-12)
+    assert torch.allclose(f(state.map(lambda field: field[0]), None, action[0]).centers[:2], near[0], atol=1e-12)
     f.neighbours = None
     assert not torch.allclose(f(state, None, action).centers[:, :2], near, atol=1e-6)
 
