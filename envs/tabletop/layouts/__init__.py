@@ -139,10 +139,10 @@ def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
 
 
 def _path(kind: type[Task], layout: int | str | Path) -> Path:
-    name = str(int(layout)) if str(layout).isdecimal() else str(layout)
-    path = _FOLDER / f"{kind.name}_{name}.yaml"
+    name = str(layout)
     if name != HARD and not name.isdecimal():
         return Path(name)
+    path = _FOLDER / f"{kind.name}_{name if name == HARD else int(name)}.yaml"
     if not path.exists():
         raise ValueError(f"unknown layout {name}: choose {_choices(kind)}")
     return path
