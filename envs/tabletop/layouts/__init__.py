@@ -48,9 +48,7 @@ def task_class(task: str | type[Task]) -> type[Task]:
 
 def layout_numbers(task: str | type[Task]) -> tuple[int, ...]:
     """The layouts of a task in this folder."""
-    prefix = f"{task_class(task).name}_"
-    numbers = [path.stem.removeprefix(prefix) for path in _FOLDER.glob(f"{prefix}*.yaml")]
-    return tuple(sorted(int(number) for number in numbers if number.isdecimal()))
+    return tuple(sorted(int(name) for name in _names(task_class(task)) if name.isdecimal()))
 
 
 def possible_tasks(
@@ -138,6 +136,10 @@ def parse_task(task: str | type[Task], content: Mapping[str, Any]) -> Task:
     return kind(**content)
 
 
+def _names(kind: type[Task]) -> list[str]:
+    return sorted(path.stem.removeprefix(f"{kind.name}_") for path in _FOLDER.glob(f"{kind.name}_*.yaml"))
+
+
 def _path(kind: type[Task], layout: int | str | Path) -> Path:
     name = str(layout)
     if name != HARD and not name.isdecimal():
@@ -169,6 +171,5 @@ def _read(path: Path, kind: type[Task]) -> dict[Any, Any]:
 
 def _choices(kind: type[Task]) -> str:
     """`0, 1, 2, random or the path of a YAML file`, as far as the task has them."""
-    own = sorted(path.stem.removeprefix(f"{kind.name}_") for path in _FOLDER.glob(f"{kind.name}_*.yaml"))
-    names = [*own, RANDOM, GENERATED]
+    names = [*_names(kind), RANDOM, GENERATED]
     return f"{', '.join(names)} or the path of a YAML file" if len(names) > 2 else "the path of a YAML file"
