@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import shlex
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
@@ -158,7 +159,7 @@ def run_stage(stage: Stage) -> Path:
             import_module(f"cavin_pyro.{stage.command}").main()
     except SystemExit as end:
         if end.code in (129, 130, 143):  # SIGHUP, SIGINT, SIGTERM
-            raise Interruption(end.code - 128) from end
+            raise Interruption(signal.Signals(end.code - 128)) from end
         last = log.read_text(encoding="utf-8").strip().splitlines()[-1].removeprefix("error: ")
         line = shlex.join(["python", "-m", f"cavin_pyro.{stage.command}", *sys.argv[1:]])
         raise UserError(f"{line} failed: {last} ({log})") from end

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import sys
 import time
 from dataclasses import replace
@@ -13,6 +14,7 @@ from types import SimpleNamespace
 import pandas as pd
 import pytest
 
+from cavin_pyro.config.application import Interruption
 from cavin_pyro.config.composition import compose
 from cavin_pyro.config.errors import UserError
 from cavin_pyro.reproduction.cells import cells
@@ -56,7 +58,7 @@ def test_a_reproduction_killed_and_resumed_with_more_episodes_equals_an_unbroken
     assert other.status == 2 and "holds a run with" in other.complaints[0]
 
 
-def test_a_failed_stage_is_told_with_its_command_and_its_last_line(
+def test_a_failed_stage_is_told_with_its_command_and_its_last_line_and_a_signal_ends_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", [])
@@ -64,6 +66,10 @@ def test_a_failed_stage_is_told_with_its_command_and_its_last_line(
     expected = r"train data=nowhere trainer.steps=0 output=.* failed: trainer.steps must be a whole .* \(.*log.txt\)"
     with pytest.raises(UserError, match=expected):
         run_stages([stage], 1)
+    monkeypatch.setattr("cavin_pyro.train.main", lambda: sys.exit(128 + signal.SIGTERM))
+    with pytest.raises(Interruption) as ended:
+        run_stages([stage], 1)
+    assert ended.value.args[0].name == "SIGTERM"
 
 
 def played() -> pd.DataFrame:
