@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from cavin_pyro.models.checks import check_number
 from cavin_pyro.models.networks.contact.geometry import (
     DISPLACEMENT_UNIT,
     MEASURES,
@@ -55,8 +54,6 @@ class ContactDynamics(Outcome):
     relation_i = sum over other real objects j of FC(FC(the same of i, the same of j, pair_ij)); pair_ij says where one
                  would push the other, moving as if alone (`contact.geometry.pair_contact`)
     motion_i, its scale = alone_i + linear of FC(object_i, relation_i)
-    With more `hops` the last two lines are repeated, with these motions for those alone: along a chain of objects that
-    push one another, as many can be moved by others.
     change of shape_i, its scale = linear of FC(FC(the same of i)): layers of their own, because 64 numbers of shape
     outweigh three of motion in the likelihood
 
@@ -87,7 +84,6 @@ class ContactDynamics(Outcome):
         shape_width: int = 64,
         reach_margin: float | None = None,
         equivariant: bool = False,
-        hops: int = 1,
     ) -> None:
         """The layers.
 
@@ -100,9 +96,8 @@ class ContactDynamics(Outcome):
             shape_width: width of the layers for the change of an object's shape.
             reach_margin: metres by which a push may pass an object that it can move; None computes all objects.
             equivariant: whether f is equivariant to turns and shifts of the table.
-            hops: how far motion spreads from the object that the tool meets, in objects.
 
-        Raises ValueError: another world, features that are no outlines, a negative margin, or no hop.
+        Raises ValueError: another world, features that are no outlines, or a negative margin.
         """
         if space is not None and (space.positions, space.action_names) != PUSHES:
             raise ValueError("dynamics=contact is for pushes on a table: choose dynamics=paper")
@@ -110,9 +105,8 @@ class ContactDynamics(Outcome):
             raise ValueError(f"dynamics=contact reads outlines with {FEATURES} numbers, not {feature_dimension}")
         if reach_margin is not None and not reach_margin >= 0:
             raise ValueError(f"reach_margin must be null or at least 0 metres, not {reach_margin}")
-        check_number("hops", hops, 1, whole=True)
         super().__init__()
-        self.reach_margin, self.equivariant, self.hops = reach_margin, equivariant, hops
+        self.reach_margin, self.equivariant = reach_margin, equivariant
         inputs = INPUTS - PLACE if equivariant else INPUTS
         self.contact = ToolContact()
         self.object = nn.Sequential(fully_connected(inputs, object_width), fully_connected(object_width, object_width))
@@ -199,8 +193,7 @@ class ContactDynamics(Outcome):
             with torch.no_grad():
                 radius = components_first(mean_extent(features).unsqueeze(-1), real.dim() - 1).squeeze(0)
                 along, across = place
-                radius = radius.expand(real.shape)
-                counting = real & in_reach(along, across, length, radius, self.reach_margin, self.hops)
+                counting = real & in_reach(along, across, length, radius.expand(real.shape), self.reach_margin)
         return Rows(counting, every=shapes_are_fixed())
 
     def _motion(self, each: Tensor, place: Tensor, outline: Tensor, rows: Rows, pairs: Pairs | None) -> Tensor:
@@ -209,18 +202,16 @@ class ContactDynamics(Outcome):
         each: `[R, inputs]`. place: `[2, R]`. outline: `[2 K + 1, R]`.
         """
         alone = self.object(each)
-        motion = after = self.alone(alone).T.contiguous()
-        relation = nothing = each.new_zeros(len(each), self.pair.out_features)
-        for _ in range(self.hops):
-            if pairs is not None:
-                measures = pair_contact(place, outline, *_aim(after[:2].detach()), pairs)
-                hidden = self.pair(measures.T) + rows.of_pairs(self.own, each, pairs.first)
-                hidden = hidden + rows.of_pairs(self.other, each, pairs.second)
-                related = self.relation(hidden.relu_()) * pairs.real.unsqueeze(-1)
-                relation = nothing.index_add(0, pairs.first, related)
-            after = self.head(self.second(torch.cat((alone, relation), -1))).T.contiguous()
-            after = torch.cat((after[:2] + motion, after[2:]))
-        return after
+        motion = self.alone(alone).T.contiguous()
+        relation = each.new_zeros(len(each), self.pair.out_features)
+        if pairs is not None:
+            measures = pair_contact(place, outline, *_aim(motion.detach()), pairs)
+            hidden = self.pair(measures.T)
+            hidden = hidden + rows.of_pairs(self.own, each, pairs.first) + rows.of_pairs(self.other, each, pairs.second)
+            related = self.relation(hidden.relu_()) * pairs.real.unsqueeze(-1)
+            relation = relation.index_add(0, pairs.first, related)
+        after = self.head(self.second(torch.cat((alone, relation), -1))).T.contiguous()
+        return torch.cat((after[:2] + motion, after[2:]))
 
 
 def _in_axes(x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:

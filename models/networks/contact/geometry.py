@@ -144,11 +144,11 @@ def pair_contact(place: Tensor, outlines: Tensor, aim: Tensor, carried: Tensor, 
     return torch.cat((offset, push * cosines[:1], push * sines[:1], own[:3], other, own[3:])) / DISPLACEMENT_UNIT
 
 
-def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, margin: float, hops: int = 1) -> Tensor:
-    """Whether the tool, or an object that it moves, comes within a margin of an object: `[M, ...]` bool.
+def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, margin: float) -> Tensor:
+    """Whether the tool, or an object that the tool moves, comes within a margin of an object: `[M, ...]` bool.
 
-    An object that the tool meets is taken for a disc that is carried along the push for the rest of its way. What it
-    pushes goes no farther, and is asked in turn what it pushes, up to `hops` objects from the tool's.
+    An object that the tool meets is taken for a disc that is carried along the push for the rest of its way. Objects
+    that such objects push are not asked what they push.
 
     `along`, `across`: `[M, ...]` metres, centres from the push's start, in its axes. `length`: `[...]` metres, of the
     push; broadcasts to `[M, ...]`. `radius`: `[M, ...]` metres, mean extent of the objects. `margin`: metres.
@@ -160,11 +160,8 @@ def in_reach(along: Tensor, across: Tensor, length: Tensor, radius: Tensor, marg
     # Of j, which is carried, and i: [i, j, ...].
     ahead, aside = along.unsqueeze(1) - along, across.unsqueeze(1) - across
     close = radius.unsqueeze(1) + (radius + (CARRIED + margin))
-    reached = met | ((_squared_distance(ahead, aside, rest) < close.square()) & met).any(1)
-    farthest = torch.where(met, rest, 0.0).amax(0)
-    for _ in range(hops - 1):
-        reached = reached | ((_squared_distance(ahead, aside, farthest) < close.square()) & reached).any(1)
-    return reached
+    pushed = (_squared_distance(ahead, aside, rest) < close.square()) & met
+    return met | pushed.any(1)
 
 
 def _squared_distance(along: Tensor, across: Tensor, length: Tensor) -> Tensor:

@@ -138,29 +138,25 @@ def next_state(f: ContactDynamics, centers: Numbers, features: Numbers, action: 
         on_table = table[2:] if f.equivariant else np.concatenate((direction, table))
         inputs.append(np.concatenate((place, shape, heights, on_table, contact)))
     each = [connected("object.1", connected("object.0", one)) for one in inputs]
-    alone = [layer("alone", one) for one in each]
-    moves = alone
-    for _ in range(f.hops):
-        ways = [np.sqrt(max(move[:2] @ move[:2], 1e-6)) for move in moves]
-        angles = [np.arctan2(move[1], move[0]) for move in moves]
-        aims, found = [np.array([np.cos(angle), np.sin(angle)]) for angle in angles], []
-        for i in range(len(centers)):
-            relation = np.zeros(len(weights["relation.0.bias"]))
-            for j in range(len(centers)):
-                if i == j:
-                    continue
-                way, own_way = DISPLACEMENT_UNIT * ways[j], DISPLACEMENT_UNIT * ways[i]
-                theirs = carrying(places[i] - places[j], aims[j], way, outlines[j], outlines[i])
-                own = carrying(places[j] - places[i], aims[i], own_way, outlines[i], outlines[j])
-                measures = np.concatenate((places[i] - places[j], theirs[2] * aims[j], theirs, own, [own_way, way]))
-                pair = layer("pair", measures / DISPLACEMENT_UNIT)
-                hidden = np.maximum(layer("own", inputs[i]) + layer("other", inputs[j]) + pair, 0.0)
-                relation += connected("relation", hidden)
-            move = layer("head", connected("second", np.concatenate((each[i], relation))))[:3]
-            found.append(move + np.append(alone[i], 0.0))
-        moves = found
+    moves = [layer("alone", one) for one in each]
+    ways = [np.sqrt(max(move @ move, 1e-6)) for move in moves]
+    angles = [np.arctan2(move[1], move[0]) for move in moves]
+    aims = [np.array([np.cos(angle), np.sin(angle)]) for angle in angles]
     new_centers, new_features = [], []
-    for i, move in enumerate(moves):
+    for i in range(len(centers)):
+        relation = np.zeros(len(weights["relation.0.bias"]))
+        for j in range(len(centers)):
+            if i == j:
+                continue
+            way, own_way = DISPLACEMENT_UNIT * ways[j], DISPLACEMENT_UNIT * ways[i]
+            theirs = carrying(places[i] - places[j], aims[j], way, outlines[j], outlines[i])
+            own = carrying(places[j] - places[i], aims[i], own_way, outlines[i], outlines[j])
+            measures = np.concatenate((places[i] - places[j], theirs[2] * aims[j], theirs, own, [own_way, way]))
+            pair = layer("pair", measures / DISPLACEMENT_UNIT)
+            hidden = np.maximum(layer("own", inputs[i]) + layer("other", inputs[j]) + pair, 0.0)
+            relation += connected("relation", hidden)
+        move = layer("head", connected("second", np.concatenate((each[i], relation))))[:3]
+        move[:2] += moves[i]
         moved = MAXIMUM_DISPLACEMENT * np.tanh(move * DISPLACEMENT_UNIT / MAXIMUM_DISPLACEMENT)
         new_centers.append(centers[i] + np.array([*(moved[:2] @ axes), moved[2]]))
         change = layer("shape_head", connected("shape.1", connected("shape.0", inputs[i])))[:-1]
