@@ -11,6 +11,7 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -141,9 +142,9 @@ def additions() -> str:
     return f"{table}\nSeeds {seeds(rows)}.\n"
 
 
-def reproduction() -> str:
+def reproduction(name: str) -> str:
     """The bars of the paper's figure by both rules, planners as in the paper, 3 objects."""
-    rows = [row for row in read("reproduction") if row["planner"] == "paper" and row["objects"] == 3]
+    rows = [row for row in read(name) if row["planner"] == "paper" and row["objects"] == 3]
     cells, lines = list(product(TASKS, ("dense", "sparse"))), []
     for rules, method in product(RULES, METHODS):
         found = groups([row for row in rows if row["method"] == method], "task", "reward")
@@ -230,12 +231,9 @@ def as_stored(name: str) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
-    "success": success,
-    "layouts": lambda: success("layouts"),
-    "hard": lambda: success("hard"),
-    "farther": lambda: success("farther"),
+    **{name: partial(success, name) for name in ("success", "layouts", "hard", "farther")},
+    **{name: partial(reproduction, name) for name in ("reproduction", "letter")},
     "additions": additions,
-    "reproduction": reproduction,
     "more_objects": more_objects,
     "variants": variants,
     "accuracy": accuracy,
