@@ -35,7 +35,7 @@ def main(config: DictConfig) -> None:
             torch.set_num_threads(threads)
             line = f"{variable}python -m cavin_pyro.{step.command} {shlex.join(step.options)}"
             print(f"\n{number + 1} of {len(steps)}, about {left} min to go: {line}", flush=True)
-            sys.argv = [f"{step.command}.py", *step.options, *({"--traceback"} & {*sys.argv})]
+            sys.argv = [f"cavin_pyro/{step.command}.py", *step.options, *({"--traceback"} & {*sys.argv})]
             import_module(f"cavin_pyro.{step.command}").main()
         print(f"\n{(time.monotonic() - begun) / 60:.1f} min in all, in {home}")
 

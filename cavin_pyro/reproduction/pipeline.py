@@ -153,7 +153,7 @@ def run_stage(stage: Stage) -> Path:
     set_matmul_precision("float32")  # which a training here before may have changed
     stage.folder.mkdir(parents=True, exist_ok=True)
     log = stage.folder / "log.txt"
-    sys.argv = [f"{stage.command}.py", *stage.options, f"output={stage.folder}"]
+    sys.argv = [f"cavin_pyro/{stage.command}.py", *stage.options, f"output={stage.folder}"]
     try:
         with open(log, "a", encoding="utf-8") as file, redirect_stdout(file), redirect_stderr(file):
             import_module(f"cavin_pyro.{stage.command}").main()

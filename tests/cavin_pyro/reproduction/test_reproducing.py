@@ -22,6 +22,7 @@ from cavin_pyro.reproduction.pipeline import Stage, run_stages
 from cavin_pyro.reproduction.results import write_results
 from cavin_pyro.reproduction.sizes import SIZES
 from cavin_pyro.reproduction.table import as_table, chosen_rows, episode_row, read_table, write_table
+from cavin_pyro.storage.checkpoint import load
 
 WHOLE = ("scale=smoke", "methods=[mpc]", "planners=[paper]", "tasks=[clearing]", "objects=[1,3]", "workers=1")
 RESULTS = ("episodes.parquet", "statistics.json", "figure-paper-strict.png", "figure-paper-published.png")
@@ -48,6 +49,8 @@ def test_a_reproduction_killed_and_resumed_with_more_episodes_equals_an_unbroken
     assert done.status == 0 and "home/results.md" in done.output, done.errors
     assert finished == {path: path.stat().st_mtime_ns for path in home.rglob("training.png")}
     assert len(read_table(home / "episodes.parquet")) == 3 + 1
+    command = load(home / "train" / "mpc-0" / "checkpoint.safetensors").provenance["command"]
+    assert command.startswith("python -m cavin_pyro.train data=home/data ")
     (tmp_path / "models").mkdir()
     shutil.copy(home / "train" / "mpc-0" / "checkpoint.safetensors", tmp_path / "models" / "mpc-0.safetensors")
     options = ("models=models", "bottom_episodes=2", "output=whole")
