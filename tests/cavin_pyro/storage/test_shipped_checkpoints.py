@@ -13,12 +13,12 @@ from cavin_pyro.storage.digests import tensors_digest
 from cavin_pyro.storage.files import file_digest
 
 SHIPPED = sorted(shipped_folder().glob("*.safetensors"))
-WEIGHTS = "ce8bc41a7dfb91a965d1773c50744c66cf475190630fbf5e5e3ebc9e83531ec3"  # of all their digests and names
+WEIGHTS = "4e3373096dd716f1af9a90e95b0744e1227f1fe11e4adc91bf46caf280f87a64"  # of all their digests and names
 
 
 def test_every_shipped_checkpoint_is_in_the_manifest_and_keeps_its_weights() -> None:
     files = {path.relative_to(shipped_folder()).as_posix(): path for path in shipped_folder().rglob("*.safetensors")}
-    assert len(files) == 23
+    assert len(files) == 32
     sums = {f"{file_digest(path)}  {name}" for name, path in files.items()}
     assert set((shipped_folder() / "sha256sums.txt").read_text().splitlines()) == sums
     digests = [f"{tensors_digest(load(path).tensors)}  {name}\n" for name, path in sorted(files.items())]
