@@ -21,22 +21,24 @@ TITLES = {"paper": "planners as in the paper", "ours": "planners with our additi
 
 
 def draw_figure(path: Path, rates: pd.DataFrame, *, planner: str, criterion: str) -> None:
-    """Both rows of the paper's figure, for one kind of planner and one criterion.
+    """The paper's figure for one kind of planner and one criterion, without its lower row if all have three objects.
 
     `rates`: as in `cavin_pyro.reproduction.table.rates`. Bars and lines are rates of success, whiskers the wider of the
     two intervals on each side.
     """
     own = rates[(rates["planner"] == planner) & (rates["criterion"] == criterion)]
     tasks = list(own["task"].unique())
-    figure = Figure(figsize=(3.6 * len(tasks) + 0.4, 5.6), dpi=DOTS_PER_INCH, layout="constrained")
-    axes = figure.subplots(2, len(tasks), squeeze=False, sharey=True)
-    for (top, bottom), task in zip(axes.T, tasks, strict=True):
-        _draw_rewards(top, own[(own["task"] == task) & (own["objects"] == TOP_ROW_OBJECTS)])
-        _draw_objects(bottom, own[(own["task"] == task) & (own["reward"] == "sparse")])
-        top.set_title(task)
+    rows = 1 if set(own["objects"]) == {TOP_ROW_OBJECTS} else 2
+    figure = Figure(figsize=(3.6 * len(tasks) + 0.4, 2.4 * rows + 0.8), dpi=DOTS_PER_INCH, layout="constrained")
+    axes = figure.subplots(rows, len(tasks), squeeze=False, sharey=True)
+    for column, task in zip(axes.T, tasks, strict=True):
+        _draw_rewards(column[0], own[(own["task"] == task) & (own["objects"] == TOP_ROW_OBJECTS)])
+        column[0].set_title(task)
+        if rows == 2:
+            _draw_objects(column[1], own[(own["task"] == task) & (own["reward"] == "sparse")])
     for row in axes:
         row[0].set_ylabel("success, %")
-    handles, labels = axes[1][0].get_legend_handles_labels()
+    handles, labels = axes[-1][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 2 * len(tasks)), frameon=False)
     figure.suptitle(f"{TITLES[planner]}; criterion: {criterion}", fontsize=10)
     save_figure(path, figure)
@@ -47,7 +49,7 @@ def _draw_rewards(axes: Axes, rates: pd.DataFrame) -> None:
     width = GROUP_WIDTH / max(1, rates["method"].nunique())
     for method, offset, own in _by_method(rates):
         places = [REWARDS.index(reward) + offset * width for reward in own["reward"]]
-        axes.bar(places, 100 * own["rate"], 0.9 * width, color=method.color)
+        axes.bar(places, 100 * own["rate"], 0.9 * width, color=method.color, label=method.label)
         axes.errorbar(places, 100 * own["rate"], _whiskers(own), fmt="none", ecolor="black", capsize=2, linewidth=0.8)
     axes.set_xticks(range(len(REWARDS)), [f"{kind} reward" for kind in REWARDS])
     axes.set_xlabel(_episodes(rates), fontsize=8)
