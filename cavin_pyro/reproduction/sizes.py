@@ -70,7 +70,7 @@ SIZES: dict[str, Size] = {
         training=TINY_TRAINING,
         planning=("planner.samples=8", "planner.horizon=6", "maximum_steps=2"),
     ),
-    "small": Size(  # three hours on two cores for the paper's planners and three objects
+    "small": Size(  # two to three hours on two cores for the paper's planners and three objects
         transitions=40_000,
         training_seeds=(0, 1, 2),
         episodes=60,
