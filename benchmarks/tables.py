@@ -231,8 +231,8 @@ def as_stored(name: str) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "readme": readme,
-    **{name: partial(success, name) for name in ("success", "layouts", "hard", "farther")},
-    **{name: partial(reproduction, name) for name in ("reproduction", "letter")},
+    **{name: partial(success, name) for name in ("success", "layouts", "farther")},
+    **{name: partial(reproduction, name) for name in ("reproduction", "standard_prior")},
     "additions": additions,
     "more_objects": more_objects,
     "variants": variants,

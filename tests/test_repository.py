@@ -143,7 +143,7 @@ def test_a_wheel_carries_every_file_that_the_packages_read() -> None:
         carried |= {file for glob in globs for file in map(Path.resolve, (ROOT / package).glob(glob))}
     data = {file for file in repository_files() if file.suffix != ".py"}
     data = {file for file in data if file.relative_to(ROOT).parts[0] in {*PACKAGES, "checkpoints"}}
-    data = {file for file in data if file.parent.name not in ("reproduction", "letter")}  # models of figures
+    data = {file for file in data if file.parent.name not in ("reproduction", "standard_prior")}  # models of figures
     assert data
     assert not [place(file) for file in sorted(data - carried)]
 
