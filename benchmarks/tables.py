@@ -52,7 +52,7 @@ def rate(rows: Sequence[Row], outcome: str = "outcome") -> str:
     if not rows:
         return ""
     found = wilson(sum(row[outcome] == "success" for row in rows), len(rows))
-    return f"{100 * found['rate']:.1f} % ({100 * found['low']:.1f} to {100 * found['high']:.1f})"
+    return f"{100 * found['rate']:.1f} % ({100 * found['low']:.1f}–{100 * found['high']:.1f})"
 
 
 def seeds(rows: Sequence[Row]) -> str:
@@ -130,52 +130,58 @@ def additions() -> str:
                 line += ["", ""]
                 continue
             without, complete, _ = paired(found, everything[cell])
-            successes = sum(row["outcome"] == "success" for row in found)
-            text = f"{100 * successes / len(found):.1f} %"
-            line.append(text if name == "nothing" else f"{text} ({without}, {complete})")
+            text = rate(found).partition(" (")[0]
             violations = sum(row["outcome"] in ("violation", "fall") for row in found)
             steps = statistics.mean(row["steps"] for row in found if row["outcome"] == "success")
-            line.append(f"{violations}, {steps:.1f}")
+            line += [text if name == "nothing" else f"{text} ({without}, {complete})", f"{violations}, {steps:.1f}"]
         lines.append(line)
     head = [text for task, objects in cells for text in (f"{task}, {objects}", "violations and falls, pushes")]
     table = markdown(["left out", "scenes", *head], lines)
     return f"{table}\nSeeds {seeds(rows)}.\n"
 
 
+def crossed(rows: Iterable[Row], line: Sequence[str], cell: Sequence[str], cells: Sequence[tuple[Any, ...]]) -> str:
+    """A line for each combination of some columns, and in it the success for combinations of others."""
+    lines = [
+        [*name, *(rate(groups(found, *cell).get(one, [])) for one in cells)]
+        for name, found in groups(rows, *line).items()
+    ]
+    return markdown([*line, *(", ".join(map(str, one)) for one in cells)], lines)
+
+
+def layouts() -> str:
+    """Each planner in each layout."""
+    rows = [{**row, "planner": row["row"].partition(",")[0]} for row in read("layouts")]
+    return crossed(rows, ("planner", "rules"), ("task", "layout"), list(product(TASKS, "012")))
+
+
+def figure(name: str, rules: Sequence[str] = RULES, **only: object) -> list[Row]:
+    """Episodes of a figure, once by each of the rules, in the order of its methods."""
+    rows = [row for row in read(name) if only.items() <= row.items()]
+    return [
+        {**row, "method": METHODS[method], "rules": one, "outcome": row[f"{one}_outcome"]}
+        for one, method in product(rules, METHODS)
+        for row in rows
+        if row["method"] == method
+    ]
+
+
 def reproduction(name: str) -> str:
-    """The bars of the paper's figure by both rules, planners as in the paper, 3 objects."""
-    rows = [row for row in read(name) if row["planner"] == "paper" and row["objects"] == 3]
-    cells, lines = list(product(TASKS, ("dense", "sparse"))), []
-    for rules, method in product(RULES, METHODS):
-        found = groups([row for row in rows if row["method"] == method], "task", "reward")
-        rates = [rate(found.get(cell, []), f"{rules}_outcome") for cell in cells]
-        if any(rates):
-            lines.append([METHODS[method], rules, *rates])
-    return markdown(["method", "rules", *map(", ".join, cells)], lines)
+    """The bars of the paper's figure, planners as in the paper."""
+    rows = figure(name, planner="paper", objects=3)
+    return crossed(rows, ("method", "rules"), ("task", "reward"), list(product(TASKS, ("dense", "sparse"))))
 
 
 def more_objects() -> str:
     """Clearing with sparse rewards against the number of objects, planners as in the paper."""
-    rows = [row for row in read("reproduction") if row["planner"] == "paper" and row["reward"] == "sparse"]
-    rows = [row for row in rows if row["task"] == "clearing"]
-    lines = []
-    for method, name in METHODS.items():
-        by_count = groups([row for row in rows if row["method"] == method], "objects")
-        lines.append([name, *(rate(by_count.get((count,), []), "published_outcome") for count in range(1, 6))])
-    return markdown(["method", *(f"{count} objects" if count > 1 else "1 object" for count in range(1, 6))], lines)
+    rows = figure("reproduction", ("published",), planner="paper", reward="sparse", task="clearing")
+    return crossed(rows, ("method",), ("objects",), [(count,) for count in range(1, 6)])
 
 
 def variants() -> str:
-    """Parts of CAVIN left out, planners otherwise as in the paper."""
-    rows = [row for row in read("reproduction") if row["reward"] == "sparse" and row["objects"] == 3]
-    lines = []
-    for (method, planner), found in groups(rows, "method", "planner").items():
-        if (method in ("cavin", "sectar") and planner != "ours") or (method, planner) == ("cavin", "ours"):
-            tasks = groups(found, "task")
-            rates = [rate(tasks.get((task,), []), f"{rules}_outcome") for rules in RULES for task in TASKS]
-            lines.append([METHODS[method], f"`{planner}`", len(found), *rates])
-    head = [f"{task}, {rules}" for rules, task in product(RULES, TASKS)]
-    return markdown(["method", "planner", "episodes", *head], lines)
+    """Parts of CAVIN left out, planners otherwise as in the paper, beside SeCTAR."""
+    rows = [row for row in figure("reproduction", reward="sparse", objects=3) if row["method"] in ("CAVIN", "SeCTAR")]
+    return crossed(rows, ("method", "planner"), ("rules", "task"), list(product(RULES, TASKS)))
 
 
 def accuracy() -> str:
@@ -185,17 +191,17 @@ def accuracy() -> str:
     who = list(dict.fromkeys(row["predictor"] for row in rows))
     lines = []
     for ahead in sorted({row["pushes"] for row in rows}):
+        pushes = f"{ahead} push{'es' * (ahead > 1)}"
         for name, objects in kinds.items():
             cells = {one: [row for row in rows if row["pushes"] == ahead and row["predictor"] == one] for one in who}
             moved = {
                 one: [100 * row["error"] for row in cells[one] if row["moved"] and row["objects"] in objects]
                 for one in who
             }
-            texts = [_errors(moved[one]) for one in who]
-            lines.append([f"{ahead} push{'es' * (ahead > 1)}, {name}", len(moved[who[0]]), *texts])
+            lines.append([f"{pushes}, {name}", len(moved[who[0]]), *map(_errors, moved.values())])
         still = {one: [row["phantom"] for row in cells[one] if not row["moved"]] for one in who}
         shares = [f"{100 * statistics.mean(still[one]):.2f} %" if any(still[one]) else "" for one in who]
-        lines.append([f"{ahead} push{'es' * (ahead > 1)}, still but said to move", len(still[who[0]]), *shares])
+        lines.append([f"{pushes}, still but said to move", len(still[who[0]]), *shares])
     return markdown(["mean / median error, cm", "objects", *who], lines)
 
 
@@ -223,22 +229,16 @@ def worlds() -> str:
     return markdown(["", *(text for (task,) in tasks for text in ("pairs", task))], lines)
 
 
-def as_stored(name: str) -> str:
-    """A file of measured times or verdicts as it is, a line per row."""
-    rows = read(name)
+def speed() -> str:
+    """Measured times as they are, a line per row."""
+    rows = read("speed")
     return markdown(list(rows[0]), [["" if value is None else value for value in row.values()] for row in rows])
 
 
 TABLES: dict[str, Callable[[], str]] = {
-    "readme": readme,
-    **{name: partial(success, name) for name in ("success", "layouts", "farther")},
+    **{name: partial(success, name) for name in ("success", "hard", "farther")},
     **{name: partial(reproduction, name) for name in ("reproduction", "standard_prior")},
-    "additions": additions,
-    "more_objects": more_objects,
-    "variants": variants,
-    "accuracy": accuracy,
-    "worlds": worlds,
-    "speed": lambda: as_stored("speed"),
+    **{one.__name__: one for one in (readme, layouts, additions, more_objects, variants, accuracy, worlds, speed)},
 }
 
 

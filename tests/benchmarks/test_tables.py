@@ -48,7 +48,7 @@ def test_pairs_and_blocks_of_seeds_are_counted(load: Callable[[str], ModuleType]
     other = [{"seed": seed, "outcome": "success" if seed > 11 else "fall"} for seed in (10, 11, 12, 13, 30)]
     assert tables.paired(one, other) == (2, 1, 1.0)
     assert tables.seeds(other) == "10 to 13, 30 to 30"
-    assert tables.rate(one) == "30.0 % (10.8 to 60.3)"
+    assert tables.rate(one) == "30.0 % (10.8–60.3)"
 
 
 def test_every_episode_of_the_results_is_kept_once() -> None:
