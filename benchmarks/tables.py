@@ -136,8 +136,7 @@ def additions() -> str:
             line += [text if name == "nothing" else f"{text} ({without}, {complete})", f"{violations}, {steps:.1f}"]
         lines.append(line)
     head = [text for task, objects in cells for text in (f"{task}, {objects}", "violations and falls, pushes")]
-    table = markdown(["left out", "scenes", *head], lines)
-    return f"{table}\nSeeds {seeds(rows)}.\n"
+    return f"{markdown(['left out', 'scenes', *head], lines)}\nSeeds {seeds(rows)}.\n"
 
 
 def crossed(rows: Iterable[Row], line: Sequence[str], cell: Sequence[str], cells: Sequence[tuple[Any, ...]]) -> str:
@@ -152,7 +151,7 @@ def crossed(rows: Iterable[Row], line: Sequence[str], cell: Sequence[str], cells
 def layouts() -> str:
     """Each planner in each layout."""
     rows = [{**row, "planner": row["row"].partition(",")[0]} for row in read("layouts")]
-    return crossed(rows, ("planner", "rules"), ("task", "layout"), list(product(TASKS, "012")))
+    return crossed(rows, ("planner", "rules"), ("task", "layout"), sorted(groups(rows, "task", "layout")))
 
 
 def figure(name: str, rules: Sequence[str] = RULES, **only: object) -> list[Row]:
