@@ -102,17 +102,17 @@ def success(name: str = "success") -> str:
     for (row, rules), found in groups(rows, "row", "rules").items():
         by_task = groups(found, "task")
         counts = ", ".join(dict.fromkeys(str(len(by_task[task])) for task in tasks if task in by_task))
-        lines.append([row, rules, counts, *(_ends(by_task.get(task, [])) for task in tasks), seeds(found)])
+        ends = [_ends(by_task[task]) if task in by_task else "" for task in tasks]
+        lines.append([row, rules, counts, *ends, seeds(found)])
     return markdown(["row", "rules", "episodes", *(task for (task,) in tasks), "seeds"], lines)
 
 
 def _ends(rows: Sequence[Row]) -> str:
     """Success with its interval; mean pushes; violations, falls and timeouts."""
-    if not rows:
-        return ""
     ends = Counter(row["outcome"] for row in rows)
-    steps = statistics.mean(row["steps"] for row in rows if row["outcome"] == "success")
-    return f"{rate(rows)}; {steps:.1f}; {ends['violation']}, {ends['fall']}, {ends['timeout']}"
+    steps = [row["steps"] for row in rows if row["outcome"] == "success"]
+    mean = f"{statistics.mean(steps):.1f}" if steps else "-"
+    return f"{rate(rows)}; {mean}; {ends['violation']}, {ends['fall']}, {ends['timeout']}"
 
 
 def additions() -> str:
