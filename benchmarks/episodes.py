@@ -100,6 +100,7 @@ LAYOUTS = [
 FEW = "{_target_:cavin_pyro.planning.additions.NearestObjects,of_all:2}"
 HARD_PLANNERS = PLANNERS | {
     "ours, guidance": ("planner.add=[guidance]",),
+    "ours, guidance, masks": ("planner.add=[guidance]", "env.segmentation=mask"),
     "ours, guidance, effects of two": (f"planner.add=[guidance,{FEW}]",),
 }
 HARD = [

@@ -186,12 +186,11 @@ def variants() -> str:
 def accuracy() -> str:
     """Errors of predicted centres, in centimetres, of objects that moved and that did not."""
     rows = read("accuracy")
-    kinds = {"all": range(1, 6), "five objects": [5]}
     who = list(dict.fromkeys(row["predictor"] for row in rows))
     lines = []
     for ahead in sorted({row["pushes"] for row in rows}):
         pushes = f"{ahead} push{'es' * (ahead > 1)}"
-        for name, objects in kinds.items():
+        for name, objects in {"all": range(1, 6), "five objects": [5]}.items():
             cells = {one: [row for row in rows if row["pushes"] == ahead and row["predictor"] == one] for one in who}
             moved = {
                 one: [100 * row["error"] for row in cells[one] if row["moved"] and row["objects"] in objects]
