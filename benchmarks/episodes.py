@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pyarrow
 import torch
+from oracle import Oracle
 from records import RESULTS, Record, commit, read, write
 
 from cavin_pyro.config.composition import compose
@@ -101,12 +102,16 @@ FEW = "{_target_:cavin_pyro.planning.additions.NearestObjects,of_all:2}"
 HARD_PLANNERS = PLANNERS | {
     "ours, guidance": ("planner.add=[guidance]",),
     "ours, guidance, masks": ("planner.add=[guidance]", "env.segmentation=mask"),
+    "ours, guidance, oracle f": (
+        "planner.add=[guidance,{_target_:oracle.Oracle}]",
+        "planner.drop=[failure_avoidance,perturbed_rollouts]",
+    ),
     "ours, guidance, effects of two": (f"planner.add=[guidance,{FEW}]",),
 }
 HARD = [
     Row(name, task, objects, ("layout=hard", *SEEN, "env.ranges.clearance=0.1", *options))
     for name, options in HARD_PLANNERS.items()
-    for task, objects in (("clearing", 9), ("insertion", 5), ("crossing", 9))
+    for task, objects in (("clearing", 10), ("insertion", 5), ("crossing", 9))
     if task == "clearing" or "of two" not in name
 ]
 
@@ -186,6 +191,7 @@ def play(job: tuple[Row, int]) -> list[Record]:
         if _runner is not None:
             _runner[1].env.close()
         _runner = overrides, make_runner(config)
+        Oracle.env = _runner[1].env
     found, given = episode_row(_runner[1].rollout(seed)), dict(option.split("=", 1) for option in row.options)
     shared = {
         **{"row": row.name, "task": row.task, "objects": row.objects, "seed": seed},
