@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import pyarrow
-from pyarrow import parquet
+import pyarrow.parquet
 
 from cavin_pyro.storage.files import atomic_write
 
@@ -24,10 +23,11 @@ def commit() -> str:
 
 def read(path: Path) -> list[Record]:
     """The rows of a file, none if there is no such file."""
-    return list(parquet.read_table(path).to_pylist()) if path.exists() else []
+    return list(pyarrow.parquet.read_table(path).to_pylist()) if path.exists() else []
 
 
 def write(path: Path, rows: Sequence[Record], schema: pyarrow.Schema | None = None) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as temporary:
-        parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), temporary)
+        table = pyarrow.Table.from_pylist(rows, schema=schema)
+        pyarrow.parquet.write_table(table, temporary, compression="zstd", compression_level=9, use_dictionary=False)
